@@ -24,7 +24,8 @@ impl Corners {
         Self { row: [[0; BLOCK]; MAX_CORNERS], fraction: [[0.0; BLOCK]; 4] }
     }
 
-    /// Computes rows and fractions of up to [`BLOCK`] `points`; unused lanes get those of the origin.
+    /// Computes rows and fractions of up to [`BLOCK`] `points`; unused lanes get those of the
+    /// origin.
     #[inline(always)]
     pub fn fill<const D: usize>(&mut self, level: &Level, points: &[[f32; D]]) {
         if level.hashed {

@@ -150,8 +150,8 @@ pub struct FieldConfig {
     /// Bias at the outer end of the margin; linear in between.
     pub density_bias_outside: f32,
     /// Whether colours start from those of the prior's nearest surface point
-    /// ([`crate::PriorColors`]): the perceptron adds to their logits where some frame saw them. Asks
-    /// for `motion.kind = surface`.
+    /// ([`crate::PriorColors`]): the perceptron adds to their logits where some frame saw them.
+    /// Asks for `motion.kind = surface`.
     pub prior_colors: bool,
     /// Whether those colours are separated from the light that all frames share.
     pub prior_light: bool,
@@ -205,11 +205,11 @@ pub struct MotionConfig {
     /// Distance from the prior's surface up to which a point can belong to the subject, normalised
     /// metres.
     pub margin: f32,
-    /// Depth below the prior's surface down to which there are samples, normalised metres. No body is
-    /// 0.3 deep: 0.3 keeps every sample.
+    /// Depth below the prior's surface down to which there are samples, normalised metres. No body
+    /// is 0.3 deep: 0.3 keeps every sample.
     pub depth: f32,
-    /// Steps between measurements of the field's outer end, beyond which samples are skipped; 0 never
-    /// skips, which `volume` asks for.
+    /// Steps between measurements of the field's outer end, beyond which samples are skipped; 0
+    /// never skips, which `volume` asks for.
     pub shell_interval: usize,
 }
 
@@ -295,8 +295,9 @@ pub struct Config {
     pub samples: usize,
     /// Transmittance, below 1, at which a training ray ends; 0 never.
     pub min_transmittance: f32,
-    /// Every `held_out`-th training frame is registered with the others, but neither colours nor the
-    /// field are learnt from it: it is scored in place of other cameras' views. 0 holds none out.
+    /// Every `held_out`-th training frame is registered with the others, but neither colours nor
+    /// the field are learnt from it: it is scored in place of other cameras' views. 0 holds none
+    /// out.
     pub held_out: usize,
     /// The perceptron.
     pub field: FieldConfig,
@@ -361,11 +362,12 @@ const NEGLIGIBLE: f32 = 1.0 / (1 << 25) as f32;
 /// `reproduce --story` takes back one by one, but for the steps:
 ///
 /// - `registration`: the prior is corrected first, as it is for every baseline.
-/// - `motion.kind`: weights of the nearest surface point in place of a weight volume of 32³, in which
-///   an arm beside a hip claims the same points: on recorded walking a tenth of the vertices are taken
-///   more than 28 cm from where they rest.
+/// - `motion.kind`: weights of the nearest surface point in place of a weight volume of 32³, in
+///   which an arm beside a hip claims the same points: on recorded walking a tenth of the vertices
+///   are taken more than 28 cm from where they rest.
 /// - `field.prior_colors`, `field.prior_light`: colours start from the corrected prior's, not grey.
-/// - `rates`: 12 to 600 times the paper's, but for the vertices', falling to a tenth; `steps`: a tenth.
+/// - `rates`: 12 to 600 times the paper's, but for the vertices', falling to a tenth; `steps`: a
+///   tenth.
 fn paper() -> Config {
     Config {
         preset: Preset::Paper,
@@ -410,9 +412,9 @@ fn paper() -> Config {
     }
 }
 
-/// The default. Without the paper's surface term, and so its coarser levels, attention and learnable
-/// vertices: they buy nothing where density and colours start from the prior's (`reproduce
-/// --components`).
+/// The default. Without the paper's surface term, and so its coarser levels, attention and
+/// learnable vertices: they buy nothing where density and colours start from the prior's
+/// (`reproduce --components`).
 fn balanced() -> Config {
     Config {
         preset: Preset::Balanced,

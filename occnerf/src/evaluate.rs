@@ -21,8 +21,8 @@ const VISIBLE: f32 = 0.001;
 /// a whole side.
 const MIN_HIDDEN_PIXELS: usize = 16;
 
-/// Scores of one picture over the pixels that are known, but for `psnr_all`; `None` where the set of
-/// pixels is empty. All pixels are known in views of cameras that training did not use.
+/// Scores of one picture over the pixels that are known, but for `psnr_all`; `None` where the set
+/// of pixels is empty. All pixels are known in views of cameras that training did not use.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrameMetrics {
     /// Name of the frame.
@@ -101,8 +101,8 @@ pub fn least_seen_quartile(scene: &Scene) -> Result<Vec<bool>, Error> {
     Ok(least)
 }
 
-/// Renders `frames` over black and scores them, with LPIPS over the whole image where `lpips` is given;
-/// `progress` hears of each finished picture.
+/// Renders `frames` over black and scores them, with LPIPS over the whole image where `lpips` is
+/// given; `progress` hears of each finished picture.
 pub fn evaluate(
     scene: &Scene,
     renderer: &mut dyn Renderer,

@@ -1,9 +1,9 @@
 //! The embedded body.
 //!
-//! `assets/open_body.bin` is the file that [`BodyModel::save`] writes, as four byte planes (byte k of
-//! every 32-bit word, for k from 0 to 3), compressed by zlib. Lengths are multiples of 2⁻¹⁶ m,
-//! weights of 2⁻¹⁶. Made from the CC0 file
-//! `open_body.npz` by `BLESS=1 cargo test -p smpl --lib the_asset`.
+//! `assets/open_body.bin` is the file that [`BodyModel::save`] writes, as four byte planes (byte k
+//! of every 32-bit word, for k from 0 to 3), compressed by zlib. Lengths are multiples of 2⁻¹⁶ m,
+//! weights of 2⁻¹⁶. Made from the CC0 file `open_body.npz` by
+//! `BLESS=1 cargo test -p smpl --lib the_asset`.
 
 use std::io::Read;
 

@@ -12,8 +12,8 @@ const HANDS: [usize; 2] = [22, 23];
 const RADIUS: f32 = 0.2;
 /// Distance of the palm's front edge, where the thumb begins, from the middle of the hand.
 const EDGE: f32 = 0.45;
-/// Share of their distance from the hand's middle by which the fingers of a fist close up, and where
-/// beyond the knuckles they do in full.
+/// Share of their distance from the hand's middle by which the fingers of a fist close up, and
+/// where beyond the knuckles they do in full.
 const CLOSED: f32 = 0.3;
 const SPREAD: f32 = 0.3;
 /// Distance beyond the knuckles from which drooping fingers are kept outside the axis of the roll.
@@ -26,8 +26,8 @@ impl BodyModel {
         (self.num_joints() == JOINTS).then_some(WRISTS)
     }
 
-    /// Vertices of the left and of the right hand with their distances beyond the knuckles along the
-    /// fingers, or beyond the palm's edge along the thumb, relative to that from wrist to hand;
+    /// Vertices of the left and of the right hand with their distances beyond the knuckles along
+    /// the fingers, or beyond the palm's edge along the thumb, relative to that from wrist to hand;
     /// negative on the palm. None of a body without SMPL's joints.
     #[must_use]
     pub fn hands(&self) -> [Vec<(usize, f32)>; 2] {
@@ -35,7 +35,8 @@ impl BodyModel {
         self.fingers().map(|hand| hand.into_iter().map(along).collect())
     }
 
-    /// Vertices of each hand, distances beyond the knuckles, and of the thumb beyond the palm's edge.
+    /// Vertices of each hand, distances beyond the knuckles, and of the thumb beyond the palm's
+    /// edge.
     fn fingers(&self) -> [Vec<(usize, f32, f32)>; 2] {
         if self.num_joints() != JOINTS {
             return Default::default();
@@ -57,8 +58,8 @@ impl BodyModel {
         })
     }
 
-    /// The body with the fingers and thumb of its left and right hand rolled up, by 0 (flat, as they
-    /// are) to 1 (a fist). The palms of the rest pose look down, as SMPL's do.
+    /// The body with the fingers and thumb of its left and right hand rolled up, by 0 (flat, as
+    /// they are) to 1 (a fist). The palms of the rest pose look down, as SMPL's do.
     ///
     /// ```
     /// let body = smpl::BodyModel::embedded();

@@ -1,7 +1,7 @@
 //! Parametric bodies in SMPL's form.
 //!
-//! [`BodyModel`] loads, shapes, poses and skins a body, with derivatives; [`MotionField`] maps points
-//! of world space back to the canonical pose; [`MotionClip`] is motion capture.
+//! [`BodyModel`] loads, shapes, poses and skins a body, with derivatives; [`MotionField`] maps
+//! points of world space back to the canonical pose; [`MotionClip`] is motion capture.
 //!
 //! ```
 //! use glam::Vec3;

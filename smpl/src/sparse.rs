@@ -57,7 +57,8 @@ impl<T: Copy> SparseRows<T> {
         self.columns[range.clone()].iter().zip(&self.values[range]).map(|(&column, &value)| (column as usize, value))
     }
 
-    /// The column of the largest value of row `row`, of equal ones the last; `None` for an empty row.
+    /// The column of the largest value of row `row`, of equal ones the last; `None` for an empty
+    /// row.
     ///
     /// # Panics
     /// If `row` is out of range.

@@ -131,8 +131,8 @@ pub fn glb(json: impl AsRef<[u8]>, binary: &[u8]) -> Vec<u8> {
 /// A tensor of [`torch`]: name, storage class, number of its storage, offset, shape and strides.
 pub type Tensor<'a> = (&'a str, &'a str, usize, u32, Vec<u32>, Vec<u32>);
 
-/// A state dictionary (an `OrderedDict` with `_metadata`) as `torch.save` writes it, in an archive or,
-/// `legacy`, as before version 1.6; storages are bytes and the size of an element.
+/// A state dictionary (an `OrderedDict` with `_metadata`) as `torch.save` writes it, in an archive
+/// or, `legacy`, as before version 1.6; storages are bytes and the size of an element.
 #[must_use]
 pub fn torch(tensors: &[Tensor<'_>], storages: &[(Vec<u8>, usize)], legacy: bool) -> Vec<u8> {
     let text = |text: &str| [b"X", &(text.len() as u32).to_le_bytes()[..], text.as_bytes()].concat();
@@ -185,7 +185,8 @@ pub fn damaged(whole: &[u8], count: usize) -> impl Iterator<Item = Vec<u8>> + '_
     })
 }
 
-/// JSON and binary data of a glTF rig: a strip of two triangles on two joints, the second 1 above the first and turning about z.
+/// JSON and binary data of a glTF rig: a strip of two triangles on two joints, the second 1 above
+/// the first and turning about z.
 #[must_use]
 pub fn arm() -> (String, Vec<u8>) {
     let mut bytes: Vec<u8> = Vec::new();

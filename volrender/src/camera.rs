@@ -100,8 +100,8 @@ impl Camera {
         Ray { origin: camera_to_world.translation.into(), direction: direction.normalize_or_zero() }
     }
 
-    /// Pixel coordinates and depth (u, v, z) of a world point, inside the image or not. `None` if it
-    /// is not in front of the camera or the result is not finite.
+    /// Pixel coordinates and depth (u, v, z) of a world point, inside the image or not. `None` if
+    /// it is not in front of the camera or the result is not finite.
     pub fn project(&self, x: Vec3) -> Option<Vec3> {
         let p = self.world_to_camera.transform_point3(x);
         if p.z.is_nan() || p.z <= 0.0 {
@@ -120,8 +120,8 @@ impl Camera {
         Self { focal: self.focal * scale, centre: self.centre * scale, width, height, ..*self }
     }
 
-    /// Position in the distorted image of `pixel` in the undistorted one: the lookup that undistorts
-    /// an image.
+    /// Position in the distorted image of `pixel` in the undistorted one: the lookup that
+    /// undistorts an image.
     pub fn distort_pixel(&self, distortion: &Distortion, pixel: Vec2) -> Vec2 {
         let p = (pixel - self.centre) / self.focal;
         self.focal * distortion.distort(p) + self.centre

@@ -63,10 +63,10 @@ pub struct OccupancyConfig {
 }
 
 impl Occupancy {
-    /// Rebuilds the grid in place for the mesh of `vertices` (V) and `faces` (F), which may be open if
-    /// the occupied cells close its holes. A point outside is occupied if it is within the entry of
-    /// `margins` (F), capped at `config.margin`, of its closest face (of all of them at an edge or
-    /// a vertex).
+    /// Rebuilds the grid in place for the mesh of `vertices` (V) and `faces` (F), which may be open
+    /// if the occupied cells close its holes. A point outside is occupied if it is within the entry
+    /// of `margins` (F), capped at `config.margin`, of its closest face (of all of them at an edge
+    /// or a vertex).
     ///
     /// A mesh without vertices, with one that is not finite, or with lengths that overflow has no
     /// occupied cells. Lengths of `config` that are negative or NaN count as 0.
@@ -280,9 +280,9 @@ fn set_bits(words: &mut [u64], from: usize, to: usize) {
     }
 }
 
-/// Extent along each axis of the unit vectors within 60° of `normal`, at least 0. The direction from
-/// the closest point on a face is its normal; at an edge or vertex it lies between the normals of
-/// the faces, within 60° of one of them unless the surface turns by more than 120°.
+/// Extent along each axis of the unit vectors within 60° of `normal`, at least 0. The direction
+/// from the closest point on a face is its normal; at an edge or vertex it lies between the normals
+/// of the faces, within 60° of one of them unless the surface turns by more than 120°.
 fn support(normal: Vec3) -> Vec3 {
     const COS: f32 = 0.5;
     const SIN: f32 = 0.866_025_4;

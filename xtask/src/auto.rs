@@ -1,7 +1,7 @@
 //! `--method auto`: the surface, with a skirt or a field where they pay.
 //!
-//! Each is fitted without every tenth frame and compared on those, by parts of the body. What does not
-//! predict unseen frames better than less is left out.
+//! Each is fitted without every tenth frame and compared on those, by parts of the body. What does
+//! not predict unseen frames better than less is left out.
 
 use anyhow::Result;
 use glam::Vec3;
@@ -37,8 +37,9 @@ const PARTS: [(&str, &[&str]); 7] = [
 ];
 const BESIDE: usize = PARTS.len() - 1;
 
-/// Compares the surface with a skirted one, if the masks show a skirt, and with a field of a few steps,
-/// on frames held out from all, and says so. A skirt that pays becomes part of the source's body.
+/// Compares the surface with a skirted one, if the masks show a skirt, and with a field of a few
+/// steps, on frames held out from all, and says so. A skirt that pays becomes part of the source's
+/// body.
 pub fn weigh(source: &mut Source, config: &Config) -> Result<Verdict> {
     let steps = TRIAL.min(config.steps);
     let config = Config { method: Method::Occnerf, steps, held_out: HOLD_OUT, ..config.clone() };
@@ -68,8 +69,8 @@ pub fn weigh(source: &mut Source, config: &Config) -> Result<Verdict> {
     Ok(verdict)
 }
 
-/// What is worth its cost of `trials`: a surface, then perhaps one with a skirt, then a field over the
-/// better of them.
+/// What is worth its cost of `trials`: a surface, then perhaps one with a skirt, then a field over
+/// the better of them.
 fn between(trials: &[Trial]) -> Verdict {
     let surface = &trials[0];
     let all = surface.pixels.iter().sum::<usize>().max(1);

@@ -17,8 +17,8 @@ use crate::run::{CHECKPOINT, RunConfig, identity, make_directory};
 /// Options that make an avatar smaller.
 #[derive(Args)]
 pub struct Sizes {
-    /// Most triangles; vertices are merged, those on seams of the texture along them, until there are
-    /// no more [default: as they are]
+    /// Most triangles; vertices are merged, those on seams of the texture along them, until there
+    /// are no more [default: as they are]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     pub triangles: Option<u32>,
     /// Longest side of the texture, texels; halved until it is no longer [default: as it is]

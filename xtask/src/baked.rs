@@ -13,8 +13,8 @@ pub fn path(run: &Path) -> PathBuf {
     run.join(AVATAR)
 }
 
-/// The saved avatar of a run with a field if it is of the run's model, else baked and saved; of a run
-/// that cannot be written it is not kept. Baking uses the capture if it is still available.
+/// The saved avatar of a run with a field if it is of the run's model, else baked and saved; of a
+/// run that cannot be written it is not kept. Baking uses the capture if it is still available.
 pub fn avatar(run: &Path, config: &RunConfig) -> Result<Avatar> {
     // Before the model is read: of a model that is replaced meanwhile the avatar is stale.
     let (path, source) = (path(run), identity(run)?);

@@ -107,7 +107,8 @@ fn share(found: &Check, wanted: impl Fn(Fault) -> bool) -> f32 {
 const GOOD: f32 = 0.05;
 const USABLE: f32 = 0.3;
 
-/// The fit's grade by its mean overlap and the share of frames that do not fit, and what to do about it.
+/// The fit's grade by its mean overlap and the share of frames that do not fit, and what to do
+/// about it.
 fn grade(iou: f32, wrong: f32) -> String {
     if iou >= 0.85 && wrong <= GOOD {
         return "fit: good".to_owned();
@@ -124,8 +125,8 @@ fn grade(iou: f32, wrong: f32) -> String {
 const CLOSE: f32 = 0.01;
 const LOOSE: f32 = 0.1;
 
-/// The masks' grade by the share of them that is not close to the body, and the share of frames where they are empty
-/// or reach farther than clothes.
+/// The masks' grade by the share of them that is not close to the body, and the share of frames
+/// where they are empty or reach farther than clothes.
 fn grade_of_masks(beyond: f32, wrong: f32) -> String {
     if beyond <= CLOSE && wrong <= GOOD {
         return "masks: good".to_owned();

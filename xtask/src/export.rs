@@ -55,9 +55,9 @@ pub struct ExportArguments {
     /// File to write
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
-    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them, or a .bvh of a rig whose
-    /// joints have the names of SMPL, Mixamo, CMU or VRM: added to a glb or vrm, in place of the
-    /// video's motion elsewhere
+    /// Motion capture, an .npz with poses, trans and fps, as AMASS has them, or a .bvh of a rig
+    /// whose joints have the names of SMPL, Mixamo, CMU or VRM: added to a glb or vrm, in place of
+    /// the video's motion elsewhere
     #[arg(long, value_name = "CLIP")]
     motion: Option<PathBuf>,
     /// Frames per second of --motion [default: as the file says]
@@ -75,7 +75,8 @@ pub struct ExportArguments {
     /// Names of the joints in a glb, vrm or bvh; those of rigged characters stay
     #[arg(long, value_enum, default_value = "smpl")]
     bones: Bones,
-    /// A glb or vrm that is shaded by the lights of the scene it stands in [default: drawn as it is]
+    /// A glb or vrm that is shaded by the lights of the scene it stands in [default: drawn as it
+    /// is]
     #[arg(long)]
     lit: bool,
     #[command(flatten)]

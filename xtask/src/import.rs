@@ -60,12 +60,12 @@ pub struct ImportArguments {
     /// What the estimator wrote: a file, or a folder
     #[arg(long, value_name = "FILE")]
     fit: PathBuf,
-    /// What the segmenter wrote: a folder, a .npy or a .npz file [default: the masks in the fit, or the
-    /// frames' alpha]
+    /// What the segmenter wrote: a folder, a .npy or a .npz file [default: the masks in the fit, or
+    /// the frames' alpha]
     #[arg(long, value_name = "DIR|FILE")]
     masks: Option<PathBuf>,
-    /// The estimator's id of the person, or several ids of one person, as 0,4,17 [default: who is there
-    /// in most frames]
+    /// The estimator's id of the person, or several ids of one person, as 0,4,17 [default: who is
+    /// there in most frames]
     #[arg(long, value_name = "IDS")]
     person: Option<String>,
     /// The person's value in masks of ids [default: 1]
@@ -77,20 +77,24 @@ pub struct ImportArguments {
     /// Focal length in pixels [default: the one that the estimator assumed]
     #[arg(long, value_name = "PX")]
     focal: Option<f64>,
-    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL, one
-    /// that fits in a folder `body` near the fit or the frames, or the open body of this program]
+    /// The body model that the estimator fitted, .npz or .pkl [default: the variable SMPL_MODEL,
+    /// one that fits in a folder `body` near the fit or the frames, or the open body of this
+    /// program]
     #[arg(long, value_name = "FILE")]
     body: Option<PathBuf>,
-    /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or mhr70
+    /// The joints of a --fit that is an array of joints: coco17, openpose25, smpl24, h36m17 or
+    /// mhr70
     #[arg(long, value_name = "SET")]
     joints: Option<String>,
-    /// Points of the body that SAM 3D Body's pred_vertices lie on, which tell the twist of limbs; those of the
-    /// open body are known, for a --body SMPL_NEUTRAL.pkl it is smpl2mhr_mapping.npz, for SMPLX_NEUTRAL.npz
-    /// smplx2mhr_mapping.npz of github.com/facebookresearch/MHR (tools/mhr_smpl_conversion/assets)
+    /// Points of the body that SAM 3D Body's pred_vertices lie on, which tell the twist of limbs;
+    /// those of the open body are known, for a --body SMPL_NEUTRAL.pkl it is smpl2mhr_mapping.npz,
+    /// for SMPLX_NEUTRAL.npz smplx2mhr_mapping.npz of github.com/facebookresearch/MHR
+    /// (tools/mhr_smpl_conversion/assets)
     #[arg(long, value_name = "FILE")]
     vertex_map: Option<PathBuf>,
-    /// 2-D key points of the frames, which registration then follows: OpenPose's folder of JSON (BODY_25),
-    /// or one person's COCO points (frames, 17, 3) of ViTPose or RTMPose, .npy, .npz or .pt
+    /// 2-D key points of the frames, which registration then follows: OpenPose's folder of JSON
+    /// (BODY_25), or one person's COCO points (frames, 17, 3) of ViTPose or RTMPose, .npy, .npz or
+    /// .pt
     #[arg(long, value_name = "DIR|FILE")]
     keypoints: Option<PathBuf>,
     /// Copy the frames into the capture; else it has links to them

@@ -13,8 +13,8 @@ use crate::{source, table};
 /// Longest list that is read.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// Trains this job's scenes of the list under OUT/SCENE; `--merge` makes the table. A failed scene is
-/// reported, and is an error after all others.
+/// Trains this job's scenes of the list under OUT/SCENE; `--merge` makes the table. A failed scene
+/// is reported, and is an error after all others.
 pub fn train_list(arguments: &TrainArguments) -> Result<()> {
     let lpips = load_lpips(arguments.lpips.as_deref())?;
     let scenes = read(arguments.list.as_deref().context("--list: no file")?)?;
@@ -78,8 +78,8 @@ fn read(path: &Path) -> Result<Vec<String>> {
     Ok(scenes)
 }
 
-/// The scene's own name, numbered where another before it has the same but for upper and lower case,
-/// which not every file system tells apart.
+/// The scene's own name, numbered where another before it has the same but for upper and lower
+/// case, which not every file system tells apart.
 pub fn unique_name(scenes: &[String], index: usize) -> String {
     let name = |i: usize| scene_name(Some(&scenes[i]));
     let own = name(index);

@@ -52,8 +52,8 @@ pub struct RunOptions {
 /// included. A failed write of the log or of a periodic checkpoint is retried later.
 ///
 /// # Errors
-/// Of a step, after saving; [`Ending::Unwritten`] for the last checkpoint; [`Ending::Stopped`] after
-/// a signal and saving; a diverged training, which replaces no checkpoint.
+/// Of a step, after saving; [`Ending::Unwritten`] for the last checkpoint; [`Ending::Stopped`]
+/// after a signal and saving; a diverged training, which replaces no checkpoint.
 pub fn optimise(directory: &Path, trainer: &mut Trainer<'_>, options: &RunOptions) -> Result<f64> {
     let guard = Guard::begin();
     let total = trainer.model().config().steps;

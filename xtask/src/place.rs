@@ -6,7 +6,8 @@ use anyhow::{Result, bail, ensure};
 
 use crate::process::unwritten;
 
-/// Errors unless `out` is absent, empty, or with `force` an earlier result marked by the file `mark`.
+/// Errors unless `out` is absent, empty, or with `force` an earlier result marked by the file
+/// `mark`.
 pub fn vacant(out: &Path, force: bool, mark: &str) -> Result<()> {
     let Ok(entries) = std::fs::read_dir(out) else {
         ensure!(!out.exists(), "{}: not a directory", out.display());

@@ -45,8 +45,8 @@ pub struct RenderArguments {
     /// Training frame of `freeview` [default: the first]
     #[arg(long, value_name = "N")]
     frame: Option<usize>,
-    /// Motion capture for `pose`: an .npz with poses, trans and fps, as AMASS has them, or a .bvh of
-    /// a rig whose joints have the names of SMPL, Mixamo, CMU or VRM
+    /// Motion capture for `pose`: an .npz with poses, trans and fps, as AMASS has them, or a .bvh
+    /// of a rig whose joints have the names of SMPL, Mixamo, CMU or VRM
     #[arg(long, value_name = "CLIP", required_if_eq("what", "pose"))]
     motion: Option<PathBuf>,
     /// Frames per second of --motion [default: as the file says]

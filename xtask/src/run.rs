@@ -75,8 +75,8 @@ impl RunConfig {
         write(&run.join(CONFIG), &toml::to_string(self)?)
     }
 
-    /// What differs between two runs of the same scene, if anything. Runs that do not say what their
-    /// capture was pass.
+    /// What differs between two runs of the same scene, if anything. Runs that do not say what
+    /// their capture was pass.
     pub fn difference(&self, other: &Self) -> Option<&'static str> {
         let changed = self.capture != other.capture && !self.capture.is_empty() && !other.capture.is_empty();
         if changed {
@@ -229,8 +229,8 @@ impl Verdict {
     }
 }
 
-/// Identity of what a run has learnt, which all that is made of it carries: SHA-256 of checkpoint or
-/// fitted surface, body and person.
+/// Identity of what a run has learnt, which all that is made of it carries: SHA-256 of checkpoint
+/// or fitted surface, body and person.
 pub fn identity(run: &Path) -> Result<String> {
     let learnt = if run.join(CHECKPOINT).exists() { CHECKPOINT } else { AVATAR };
     let files = [learnt, "body.safetensors", "person.safetensors"].map(|name| run.join(name));

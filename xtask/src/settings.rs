@@ -13,8 +13,8 @@ pub const HOLD_OUT: usize = 10;
 /// A method, or the choice of one by the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MethodChoice {
-    /// [`Method::Surface`], or [`Method::Occnerf`] where a field gains on frames held out, and a skirt
-    /// where one does.
+    /// [`Method::Surface`], or [`Method::Occnerf`] where a field gains on frames held out, and a
+    /// skirt where one does.
     Auto,
     /// This one.
     Named(Method),

@@ -32,8 +32,8 @@ pub struct Shard {
 }
 
 impl Shard {
-    /// Whether run number `run` is in this shard. Round robin with a rotating start, so that the same
-    /// run of each scene is spread over shards.
+    /// Whether run number `run` is in this shard. Round robin with a rotating start, so that the
+    /// same run of each scene is spread over shards.
     pub fn has(&self, run: usize) -> bool {
         (run + run / self.count) % self.count == self.index
     }

@@ -1,4 +1,5 @@
-//! Where the frames come from: a capture on disk with its body model, or the demo, which is one too.
+//! Where the frames come from: a capture on disk with its body model, or the demo, which is one
+//! too.
 
 use std::cell::RefCell;
 use std::fs::File;
@@ -39,8 +40,8 @@ pub struct Source {
 }
 
 impl Source {
-    /// Identity of the training data, independent of its path: SHA-256 of the body's file, and of every
-    /// frame's pictures, camera, pose and shape.
+    /// Identity of the training data, independent of its path: SHA-256 of the body's file, and of
+    /// every frame's pictures, camera, pose and shape.
     ///
     /// # Errors
     /// Files that cannot be read.
@@ -149,8 +150,8 @@ impl LoadArguments {
     }
 }
 
-/// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's own,
-/// that of the variable SMPL_MODEL, or what lies near the scene.
+/// Loads `scene`, the demo if it is `None` or named [`DEMO`]; the body is `body`, the capture's
+/// own, that of the variable SMPL_MODEL, or what lies near the scene.
 pub fn load(scene: Option<&str>, body: Option<&Path>, options: &LoadOptions) -> Result<Source> {
     load_with(scene, body, options, |_, _| Ok(()))
 }

@@ -9,7 +9,8 @@ fn cell(value: Option<f64>, digits: usize) -> String {
 /// A row for each run: novel views where there are any, ranked quantities first.
 pub fn markdown(rows: &[(String, &Metrics)]) -> String {
     let networks: Vec<&str> = rows.iter().filter_map(|(_, m)| m.lpips.as_deref()).collect();
-    // Where pixels are unknown, beside the score of the known ones: their share, and a score of all.
+    // Where pixels are unknown, beside the score of the known ones: their share, and a score of
+    // all.
     let splits = || rows.iter().filter_map(|(_, m)| m.splits.first());
     let excuses = splits().any(|(_, split)| split.known.is_some_and(|known| known < 1.0));
     let header = "method|occluded|steps|train s|psnr_mask|psnr_hidden|ssim_mask|psnr_vis|ssim_vis|psnr_full|ssim_full|\

@@ -342,8 +342,8 @@ pub fn unless_finished(
     make(old.is_some() && differs.is_none())
 }
 
-/// The scores under `directory` of the same run and of the model under `trained`; `None` where it has
-/// not come to them.
+/// The scores under `directory` of the same run and of the model under `trained`; `None` where it
+/// has not come to them.
 pub fn finished(directory: &Path, trained: &Path, run: &RunConfig) -> Result<Option<Metrics>> {
     let is_same = RunConfig::read(directory).is_ok_and(|old| old.same_scene(run) && old.difference(run).is_none());
     let metrics = if is_same { Metrics::fresh(directory, trained)? } else { None };

@@ -21,8 +21,8 @@ pub(super) struct Lens {
 }
 
 impl Lens {
-    /// From a row-major calibration matrix (9) that puts the first pixel's centre at `pixel_centre`,
-    /// and k1 k2 p1 p2 k3; the error describes the fault.
+    /// From a row-major calibration matrix (9) that puts the first pixel's centre at
+    /// `pixel_centre`, and k1 k2 p1 p2 k3; the error describes the fault.
     pub fn new(k: &[f32], extrinsics: Affine3A, d: [f32; 5], pixel_centre: f32) -> Result<Self, String> {
         let mut intrinsics = Mat3::from_cols_slice(k).transpose();
         let focal = k[0].min(k[4])..=k[0].max(k[4]);

@@ -92,8 +92,8 @@ pub(super) fn keypoints(record: &Item<'_>, body: &BodyModel) -> Result<Vec<Keypo
     values.chunks_exact(4).map(point).collect()
 }
 
-/// A body in ZJU-MoCap's way: `poses` with a zero root, rotation `Rh` and translation `Th` about the
-/// origin, and shape coefficients under `key`.
+/// A body in ZJU-MoCap's way: `poses` with a zero root, rotation `Rh` and translation `Th` about
+/// the origin, and shape coefficients under `key`.
 pub(super) fn about_origin(record: &Item<'_>, key: &str, body: &BodyModel) -> Result<Fitted, CaptureError> {
     let vector = |key: &str, most: f32| {
         let item = record.get(key)?;

@@ -70,8 +70,8 @@ impl View {
         u64::from(width) * u64::from(height) * PIXEL_BYTES
     }
 
-    /// The frames, checked together. Pictures within `budget` are decoded; of the others, headers are
-    /// checked.
+    /// The frames, checked together. Pictures within `budget` are decoded; of the others, headers
+    /// are checked.
     fn frames(self, body: &BodyModel, options: &LoadOptions, budget: &Budget) -> Result<Vec<Frame>, CaptureError> {
         let first = Arc::from(self.frames[0].name.as_str());
         let (size, to) = (self.size, options.resized(self.size));

@@ -68,8 +68,8 @@ pub fn own_body(dir: &Path) -> Option<PathBuf> {
     ["body.npz", "body.safetensors"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file())
 }
 
-/// Files with one of `extensions` in directories `body` beside `place` and its ancestors, the nearest
-/// first, by name.
+/// Files with one of `extensions` in directories `body` beside `place` and its ancestors, the
+/// nearest first, by name.
 pub(super) fn near_bodies(place: &Path, extensions: &[&str]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for above in place.ancestors() {

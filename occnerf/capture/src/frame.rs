@@ -101,8 +101,8 @@ impl From<Capture> for Mended {
 pub struct Registered {
     /// The capture.
     pub capture: Capture,
-    /// Registered offset of clothes and hair along each vertex normal, in the capture's units; empty
-    /// where unknown.
+    /// Registered offset of clothes and hair along each vertex normal, in the capture's units;
+    /// empty where unknown.
     pub clothes: Vec<f32>,
     /// [`Mended::mending`].
     pub mending: Mending,

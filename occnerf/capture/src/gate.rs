@@ -16,8 +16,8 @@ impl Gate {
         Self { limit, taken: Mutex::new(0), freed: Condvar::new() }
     }
 
-    /// Runs `work` once its bytes are admitted; work above the limit runs alone. `work` must not wait
-    /// for other threads, which may be blocked here.
+    /// Runs `work` once its bytes are admitted; work above the limit runs alone. `work` must not
+    /// wait for other threads, which may be blocked here.
     pub fn pass<T>(&self, bytes: u64, work: impl FnOnce() -> T) -> T {
         let fits = |taken: &mut u64| *taken > 0 && taken.saturating_add(bytes) > self.limit;
         // The count stays valid when a decoder panics.

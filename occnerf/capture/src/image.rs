@@ -46,12 +46,12 @@ impl Image {
     }
 
     /// Reads a PNG or JPEG of 8 or 16 bits a channel, turned upright by the orientation of its Exif
-    /// data; grey becomes RGB, transparency is dropped. Colours are taken for sRGB: embedded profiles
-    /// and gamma chunks are not applied.
+    /// data; grey becomes RGB, transparency is dropped. Colours are taken for sRGB: embedded
+    /// profiles and gamma chunks are not applied.
     ///
     /// # Errors
-    /// [`CaptureError::Io`], [`CaptureError::Picture`], and, before decoding, [`CaptureError::Invalid`]
-    /// for a side of 0 or above 8192.
+    /// [`CaptureError::Io`], [`CaptureError::Picture`], and, before decoding,
+    /// [`CaptureError::Invalid`] for a side of 0 or above 8192.
     pub fn load(path: &Path) -> Result<Self, CaptureError> {
         let decoded = decode(path)?.into_rgb32f();
         Ok(Self { width: decoded.width(), height: decoded.height(), pixels: decoded.into_raw() })

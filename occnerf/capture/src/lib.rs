@@ -61,16 +61,16 @@ use std::path::Path;
 /// checked, and each is decoded at every use.
 ///
 /// Images are multiplied by their masks; both are undistorted and resized to
-/// [`LoadOptions::resize`]. A frame may have no subject pixel (fully occluded), but not all frames of
-/// a camera.
+/// [`LoadOptions::resize`]. A frame may have no subject pixel (fully occluded), but not all frames
+/// of a camera.
 ///
 /// # Errors
 /// The first problem in the order files are read, training before evaluation: an unknown layout;
 /// files that are missing, unreadable, truncated (except undecoded pictures) or name anything to
-/// execute; frames without camera or body parameters; images and masks of unequal sizes or above 8192
-/// pixels; bodies beyond [`LoadOptions::max_bytes`]; arrays of another shape, or not finite; invalid
-/// cameras, or none with the body in view; a body model with other joints or vertices than the
-/// file's; options outside their ranges.
+/// execute; frames without camera or body parameters; images and masks of unequal sizes or above
+/// 8192 pixels; bodies beyond [`LoadOptions::max_bytes`]; arrays of another shape, or not finite;
+/// invalid cameras, or none with the body in view; a body model with other joints or vertices than
+/// the file's; options outside their ranges.
 pub fn load_capture(dir: &Path, body: &smpl::BodyModel, options: &LoadOptions) -> Result<Capture, CaptureError> {
     options.check()?;
     match find::Layout::detect(dir)? {

@@ -3,8 +3,8 @@
 use glam::Vec2;
 use volrender::{Camera, Distortion};
 
-/// Undistorts `source` (H, W, channels) of `camera` with `distortion`: bilinear, 0 beyond the border
-/// and where the distortion model folds back.
+/// Undistorts `source` (H, W, channels) of `camera` with `distortion`: bilinear, 0 beyond the
+/// border and where the distortion model folds back.
 pub(super) fn undistort(source: Vec<f32>, channels: usize, camera: &Camera, distortion: &Distortion) -> Vec<f32> {
     if distortion.is_identity() {
         return source;

@@ -157,9 +157,9 @@ impl Lpips {
         self.compare(a, b, [width, height], None)
     }
 
-    /// Computes [`Lpips::distance`] and adds `d_distance` × the gradient of each image's distance by
-    /// that image to `d_a` (like `a`). Where pixels of a pooling window share the maximum, the first
-    /// gets the gradient; a distance of 0 has none.
+    /// Computes [`Lpips::distance`] and adds `d_distance` × the gradient of each image's distance
+    /// by that image to `d_a` (like `a`). Where pixels of a pooling window share the maximum, the
+    /// first gets the gradient; a distance of 0 has none.
     ///
     /// Meant for patches: takes about five kilobytes for each pixel of an image pair.
     ///

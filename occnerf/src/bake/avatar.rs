@@ -41,8 +41,8 @@ pub struct Avatar {
     pub joints: Vec<[u16; 4]>,
     /// Their weights, (V): not negative, summing to 1.
     pub weights: Vec<[f32; 4]>,
-    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; empty rows for
-    /// skinning alone. Formats without them leave them out.
+    /// Pose blend shapes, (V, 9(J−1)), in the order of [`smpl::BodyModel::posedirs`]; empty rows
+    /// for skinning alone. Formats without them leave them out.
     pub posedirs: SparseRows<Vec3>,
     /// Colours and confidence.
     pub atlas: Atlas,

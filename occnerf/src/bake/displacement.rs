@@ -21,8 +21,8 @@ const ROUNDS: usize = 5;
 const MOST_FRAMES: usize = 96;
 /// Search distance of the mask's edge in the first round and in the last, pixels.
 const REACH: [f32; 2] = [10.0, 4.0];
-/// Standard deviation of an outline residual, pixels: so small that an outline follows the median of the
-/// frames, not the mean.
+/// Standard deviation of an outline residual, pixels: so small that an outline follows the median
+/// of the frames, not the mean.
 const OUTLINE: f32 = 0.15;
 /// Standard deviation of the heights' Laplacian, in edge lengths.
 const BEND: f32 = 0.08;
@@ -160,9 +160,9 @@ impl Plate {
     }
 }
 
-/// An approximate solution of A x = `rhs` after `iterations` steps of conjugate gradients (Hestenes and
-/// Stiefel 1952) from 0, preconditioned by the `diagonal` of the symmetric positive definite A. `apply`
-/// maps x to A x.
+/// An approximate solution of A x = `rhs` after `iterations` steps of conjugate gradients (Hestenes
+/// and Stiefel 1952) from 0, preconditioned by the `diagonal` of the symmetric positive definite A.
+/// `apply` maps x to A x.
 fn conjugate_gradients(
     apply: impl Fn(&[f32]) -> Vec<f32>,
     rhs: &[f32],

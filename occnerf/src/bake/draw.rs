@@ -34,8 +34,8 @@ pub struct BakedRenderer<'a> {
 }
 
 impl<'a> BakedRenderer<'a> {
-    /// For bones and cameras in which an avatar's metre is `scale` long, under `light`, with `samples` a
-    /// pixel.
+    /// For bones and cameras in which an avatar's metre is `scale` long, under `light`, with
+    /// `samples` a pixel.
     #[must_use]
     pub fn new(avatar: &'a Avatar, scale: f32, light: Light, samples: Samples) -> Self {
         Self {
@@ -53,8 +53,9 @@ impl<'a> BakedRenderer<'a> {
         }
     }
 
-    /// World positions of the vertices, (V), and, as z after their places in the atlas in texels, their
-    /// shading, (V): pose blend shapes, then linear blend skinning by `bones` (J), canonical to world.
+    /// World positions of the vertices, (V), and, as z after their places in the atlas in texels,
+    /// their shading, (V): pose blend shapes, then linear blend skinning by `bones` (J), canonical
+    /// to world.
     ///
     /// # Panics
     /// Unless there are J bones.
@@ -84,8 +85,8 @@ impl<'a> BakedRenderer<'a> {
     /// opacity of each pixel, (H·W, row-major).
     ///
     /// # Errors
-    /// [`Error::Scene`] for bones of another skeleton; [`Error::Visibility`] for pictures that are too
-    /// large.
+    /// [`Error::Scene`] for bones of another skeleton; [`Error::Visibility`] for pictures that are
+    /// too large.
     pub fn draw(&mut self, bones: &[Affine3A], camera: &Camera) -> Result<&[Vec4], Error> {
         let (expected, found) = (self.avatar.num_joints(), bones.len());
         if found != expected {

@@ -27,8 +27,8 @@ use crate::scene::prepared::Scene;
 /// Target edge length of the surface, pixels of the training frames, and most subdivisions.
 const EDGE: f32 = 1.5;
 const MOST: u32 = 2;
-/// Width of a pixel for which a fitted surface is subdivided, at least, normalised metres: that of the
-/// crops which show its outline.
+/// Width of a pixel for which a fitted surface is subdivided, at least, normalised metres: that of
+/// the crops which show its outline.
 const FINEST: f32 = 0.007;
 /// Texels across a pixel of the training frames.
 const TEXELS_A_PIXEL: f32 = 2.0;
@@ -40,8 +40,8 @@ const MAX_SIDE: u32 = 2048;
 const REFINEMENTS: u32 = 4;
 /// Frames per second of the video's motion.
 const FPS: f32 = 30.0;
-/// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to .960
-/// on the demo, whatever the number of samples), 3 to 4 best.
+/// [`CanonicalField::grazing`]; 2 to 6 cm draw outlines that fit those of pictures (IoU .956 to
+/// .960 on the demo, whatever the number of samples), 3 to 4 best.
 const GRAZING: f32 = 0.035;
 
 /// Statistics of [`bake`].
@@ -57,8 +57,8 @@ pub struct BakeReport {
     pub side: u32,
     /// Texels on the surface.
     pub texels: usize,
-    /// Mean squared error over known training pixels on the surface, before the first step of texture
-    /// optimisation and before the last.
+    /// Mean squared error over known training pixels on the surface, before the first step of
+    /// texture optimisation and before the last.
     pub errors: [f64; 2],
     /// Wall clock, seconds.
     pub seconds: f64,
@@ -68,8 +68,8 @@ pub struct BakeReport {
 /// optimisation; without it all confidence is 1 and the texture is the field's.
 ///
 /// # Errors
-/// [`Error::Scene`] for a body of more than [`MAX_JOINTS`] joints, one that no camera sees, or one that
-/// needs more charts than the atlas has room for; those of frames that cannot be decoded.
+/// [`Error::Scene`] for a body of more than [`MAX_JOINTS`] joints, one that no camera sees, or one
+/// that needs more charts than the atlas has room for; those of frames that cannot be decoded.
 pub fn bake(model: &Model, scene: Option<&Scene>) -> Result<(Avatar, BakeReport), Error> {
     let start = Instant::now();
     let pixel = checked_pixel(&model.body, model.frames())?;
@@ -90,8 +90,8 @@ pub fn bake(model: &Model, scene: Option<&Scene>) -> Result<(Avatar, BakeReport)
     Ok((avatar, report))
 }
 
-/// Fits a surface and its texture to the training frames of a scene, without a field: heights over the
-/// prior, and the prior's colours refined.
+/// Fits a surface and its texture to the training frames of a scene, without a field: heights over
+/// the prior, and the prior's colours refined.
 ///
 /// # Errors
 /// Those of [`bake`].
@@ -163,8 +163,8 @@ impl Relief {
     }
 }
 
-/// The avatar without name and motion, for a pixel width of `pixel` normalised metres and a confidence
-/// `seen` of each vertex of the prior, (V).
+/// The avatar without name and motion, for a pixel width of `pixel` normalised metres and a
+/// confidence `seen` of each vertex of the prior, (V).
 pub(super) fn surface(
     body: &Body,
     field: &CanonicalField<'_>,

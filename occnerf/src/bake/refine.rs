@@ -26,8 +26,8 @@ use crate::scene::seen::depth_inside;
 /// Regularisation of a texel towards its colour before, in pixels.
 const PRIOR: f32 = 0.3;
 
-/// Parts of the video, which belong to one half of the frames and the other in turn: neighbouring frames
-/// have the same errors of registration.
+/// Parts of the video, which belong to one half of the frames and the other in turn: neighbouring
+/// frames have the same errors of registration.
 const BLOCKS: usize = 32;
 
 /// Least weight of a texel in either half for their agreement, in pixels.
@@ -58,9 +58,9 @@ impl PixelEquation {
     }
 }
 
-/// Fits the colours of the texels to the known pixels of the training frames by `passes` Jacobi steps
-/// of regularised least squares; unobserved texels keep their colours. Returns the mean squared error
-/// before the first step and before the last.
+/// Fits the colours of the texels to the known pixels of the training frames by `passes` Jacobi
+/// steps of regularised least squares; unobserved texels keep their colours. Returns the mean
+/// squared error before the first step and before the last.
 pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u32) -> Result<[f64; 2], Error> {
     let frames = &scene.train;
     let stride = frames.iter().map(|f| f.labels.num_subject()).sum::<usize>().div_ceil(MAX_PIXELS).max(1);
@@ -84,9 +84,9 @@ pub(super) fn refine(scene: &Scene, light: Light, avatar: &mut Avatar, passes: u
     Ok(errors)
 }
 
-/// Jacobi steps on the texels' `values` (H · W) for the equations of two halves of the frames, whose details
-/// count as far as the halves agree. Residuals are weighted robustly by the share of `disagreement` of the
-/// frames.
+/// Jacobi steps on the texels' `values` (H · W) for the equations of two halves of the frames,
+/// whose details count as far as the halves agree. Residuals are weighted robustly by the share of
+/// `disagreement` of the frames.
 fn solve(
     values: &mut Vec<Vec3>,
     halves: [Vec<PixelEquation>; 2],
@@ -148,8 +148,8 @@ fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreem
     Estimate { values, weights, errors }
 }
 
-/// Equations of the fully covered subject pixels of a frame; `hands` has where it may show hands, and
-/// whether each vertex of the avatar (V) belongs to a forearm or hand.
+/// Equations of the fully covered subject pixels of a frame; `hands` has where it may show hands,
+/// and whether each vertex of the avatar (V) belongs to a forearm or hand.
 fn equations(
     avatar: &Avatar,
     renderer: &mut BakedRenderer<'_>,
@@ -245,8 +245,8 @@ impl Shown {
         Self { texels, positions, width }
     }
 
-    /// Binomial filter [1 2 1] / 4 of `values`, a shown texel each, along both axes, with taps `step`
-    /// texels apart; a texel stands in for neighbours that are not shown.
+    /// Binomial filter [1 2 1] / 4 of `values`, a shown texel each, along both axes, with taps
+    /// `step` texels apart; a texel stands in for neighbours that are not shown.
     fn filter<T>(&self, values: &[T], step: usize) -> Vec<T>
     where
         T: Copy + Send + Sync + Add<Output = T> + Mul<f32, Output = T>,
@@ -265,8 +265,8 @@ impl Shown {
         along(&along(values, step), step * self.width)
     }
 
-    /// The `update` of the shown texels with each band of detail shrunk to what the updates of the `halves`
-    /// share.
+    /// The `update` of the shown texels with each band of detail shrunk to what the updates of the
+    /// `halves` share.
     pub fn shrunk(&self, update: &[Vec3], halves: [&[Vec3]; 2]) -> Vec<Vec3> {
         let mut rests = [update.to_vec(), halves[0].to_vec(), halves[1].to_vec()];
         let mut out = vec![Vec3::ZERO; update.len()];
@@ -394,8 +394,8 @@ mod tests {
             prop_assert!(found.iter().zip(&values).all(|(a, b)| a.distance(*b) < 1e-4));
         }
 
-        /// A pattern with noise that differs between the halves comes nearer to the pattern; noise alone
-        /// nearly vanishes.
+        /// A pattern with noise that differs between the halves comes nearer to the pattern; noise
+        /// alone nearly vanishes.
         #[test]
         fn details_that_differ_vanish(seed in any::<u64>()) {
             const SIDE: usize = 64;

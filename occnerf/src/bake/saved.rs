@@ -34,8 +34,8 @@ struct Header {
 }
 
 impl Avatar {
-    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. The file is
-    /// replaced atomically; equal avatars give equal files.
+    /// Writes the avatar as `.safetensors`, which [`Avatar::load`] reads back bit for bit. The file
+    /// is replaced atomically; equal avatars give equal files.
     ///
     /// Tensors have the names and shapes of the fields; `cameras.intrinsics` is (T, 4): fx fy cx
     /// cy, `cameras.extrinsics` (T, 3, 4), `cameras.size` (T, 2): width, height; clip K has
@@ -104,7 +104,8 @@ impl Avatar {
     /// Reads a file of [`Avatar::save`].
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for anything but a complete, valid avatar.
+    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for anything but a complete, valid
+    /// avatar.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let avatar = parse(path, &read(path)?)?;
         avatar.validate().map_err(|what| file(path, what))?;

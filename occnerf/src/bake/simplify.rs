@@ -9,7 +9,8 @@ use smpl::SparseRows;
 use super::{Avatar, Clip};
 use crate::Error;
 
-/// Poses in which the error is measured: at rest, in which bent joints are straight, and of the video.
+/// Poses in which the error is measured: at rest, in which bent joints are straight, and of the
+/// video.
 const POSES: usize = 4;
 /// Coordinates of a vertex: its places in all poses, and in the atlas.
 const N: usize = 3 * POSES + 2;

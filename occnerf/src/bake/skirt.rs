@@ -1,9 +1,9 @@
 //! Skirts: a closed surface around both thighs, added to a body where masks reach beyond it.
 //!
 //! Points have cylindrical coordinates about an axis between the legs at rest and belong to pelvis
-//! and thighs by height and side. The frames' masks carve the region (visual hull, Laurentini 1994),
-//! and so do the silhouettes of the dressed prior; the skirt is where the first hull is wider than
-//! the second. Poses, displacement and texture treat the extended body like any other.
+//! and thighs by height and side. The frames' masks carve the region (visual hull, Laurentini
+//! 1994), and so do the silhouettes of the dressed prior; the skirt is where the first hull is
+//! wider than the second. Poses, displacement and texture treat the extended body like any other.
 
 use std::f32::consts::TAU;
 
@@ -156,8 +156,8 @@ impl Tube {
         Vec3::new(self.axis.x + radius * sin, self.y(ring), self.axis.z + radius * cos)
     }
 
-    /// Weights of pelvis, left and right hip: the thighs' grow from hips to knees, left and right blend
-    /// between the hips.
+    /// Weights of pelvis, left and right hip: the thighs' grow from hips to knees, left and right
+    /// blend between the hips.
     fn weights(&self, at: Vec3) -> [f32; 3] {
         let thighs = ((self.hip - at.y) / (self.hip - self.knee)).clamp(0.0, 1.0);
         let side = (0.5 + 0.5 * (at.x - self.axis.x) / self.half).clamp(0.0, 1.0);
@@ -170,8 +170,9 @@ impl Tube {
         self.joints.into_iter().zip(self.weights(at)).map(bone).sum()
     }
 
-    /// What a frame's mask, and the prior's silhouette, say of each point, (rings, angles, radii): positive
-    /// for inside, negative for background. A radius counts most where it lies in the image plane.
+    /// What a frame's mask, and the prior's silhouette, say of each point, (rings, angles, radii):
+    /// positive for inside, negative for background. A radius counts most where it lies in the
+    /// image plane.
     fn votes(&self, scene: &Scene, frame: &PreparedFrame) -> Result<[Vec<f32>; 2], Error> {
         let (view, faces) = (&frame.view, &scene.body.model.faces);
         let mut clothed = view.posed.vertices.clone();
@@ -215,7 +216,8 @@ impl Tube {
         Ok([mask, prior])
     }
 
-    /// The model of a body with a closed surface of rings from `first` down, at `radii` (rings, angles).
+    /// The model of a body with a closed surface of rings from `first` down, at `radii` (rings,
+    /// angles).
     fn sewn(&self, body: &Body, first: usize, radii: &[f32]) -> BodyModel {
         let (rings, around) = (radii.len() / ANGLES, |angle: usize| angle % ANGLES);
         let mean = |ring: usize, angle: usize| -> f32 {

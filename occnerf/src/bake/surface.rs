@@ -110,8 +110,8 @@ fn crossings(field: &CanonicalField<'_>, prior: &MeshDistance, normals: &[Normal
 }
 
 /// The height at which the opacity passes ½. The optical depth is the integral from outside plus a
-/// length of `grazing` at the greatest density so far, which puts the surface of a fuzzy field at its
-/// rendered outline.
+/// length of `grazing` at the greatest density so far, which puts the surface of a fuzzy field at
+/// its rendered outline.
 fn crossing(heights: &[f32], densities: &[(f32, Vec3)], grazing: f32) -> f32 {
     let (mut depth, mut thickest, mut previous) = (0.0, 0.0f32, 0.0);
     for (&height, &(density, _)) in heights.iter().zip(densities) {
@@ -161,8 +161,8 @@ fn smoothed(heights: &[f32], near: &[Vec<u32>]) -> Vec<f32> {
     near.iter().zip(heights).map(halfway).collect()
 }
 
-/// Fills NaN with the mean of the neighbours, from the rim inwards; 0, the prior itself, without any
-/// finite height.
+/// Fills NaN with the mean of the neighbours, from the rim inwards; 0, the prior itself, without
+/// any finite height.
 fn fill(heights: &mut [f32], near: &[Vec<u32>]) {
     let mut missing: Vec<usize> = (0..heights.len()).filter(|&v| heights[v].is_nan()).collect();
     while !missing.is_empty() {
@@ -209,9 +209,9 @@ impl Texel {
     }
 }
 
-/// Rasterises `faces` with vertices at `places` (V, texels) into a square of `side`: the texels whose
-/// centres are covered. `describe` maps a face to its vertices in the subdivided prior and its face
-/// of the prior.
+/// Rasterises `faces` with vertices at `places` (V, texels) into a square of `side`: the texels
+/// whose centres are covered. `describe` maps a face to its vertices in the subdivided prior and
+/// its face of the prior.
 pub(super) fn texels(
     side: u32,
     places: &[Vec2],
@@ -230,7 +230,8 @@ pub(super) fn texels(
     Ok((0..).zip(drawn).filter_map(texel).collect())
 }
 
-/// Colour of the field at each of `texels`, on the surface at `heights` (V) over the prior's `normals` (V).
+/// Colour of the field at each of `texels`, on the surface at `heights` (V) over the prior's
+/// `normals` (V).
 pub(super) fn paint(
     field: &CanonicalField<'_>,
     prior: &MeshDistance,
@@ -250,8 +251,8 @@ pub(super) fn paint(
     texels.par_chunks(TEXELS).flat_map_iter(chunk).collect()
 }
 
-/// Dilates the values of the `known` texels over all others, ring by ring, for bilinear lookups at the
-/// rim of a chart.
+/// Dilates the values of the `known` texels over all others, ring by ring, for bilinear lookups at
+/// the rim of a chart.
 pub(super) fn dilate<const N: usize>(side: usize, values: &mut [[f32; N]], known: &mut [bool]) {
     let mut rim: Vec<usize> = (0..known.len()).filter(|&i| !known[i]).collect();
     while !rim.is_empty() {

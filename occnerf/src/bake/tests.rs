@@ -47,8 +47,8 @@ fn baked(density: impl Fn(Vec3, f32) -> f32 + Sync) -> (Scene, Avatar, BakeRepor
     (scene, avatar, report)
 }
 
-/// Whether each vertex of an avatar moves with no hand, foot or head: surfaces are smoothed across the
-/// folds of fingers, toes, eyes and lips.
+/// Whether each vertex of an avatar moves with no hand, foot or head: surfaces are smoothed across
+/// the folds of fingers, toes, eyes and lips.
 fn off_folds(avatar: &Avatar) -> Vec<bool> {
     let folded = |joint: u16| matches!(joint, 7 | 8 | 10 | 11 | 15 | 20..);
     let weight = |(joints, weights): (&[u16; 4], &[f32; 4])| -> f32 {
@@ -311,7 +311,8 @@ fn an_avatar_moves_as_the_prior_that_it_came_from() {
         let (moved, _) = avatar.skin(&avatar.bones(pose, motion.trans[t]), pose);
         for (of_avatar, of_prior) in avatar.faces.as_flattened().iter().zip(faces.as_flattened()) {
             let (here, there) = (moved[*of_avatar as usize], view.posed.vertices[*of_prior as usize]);
-            // The betas of the demo's frames are the mean ones; four weights a vertex of at most four.
+            // The betas of the demo's frames are the mean ones; four weights a vertex of at most
+            // four.
             assert!(here.distance(world * there) < 2e-4, "frame {t}: {here}");
             // The camera sees it where the capture's camera saw it.
             let [here, there] = [avatar.cameras[t].project(here).unwrap(), view.camera.project(there).unwrap()];

@@ -22,7 +22,8 @@ pub enum Fault {
     PoseJump,
     /// The mask shows a limb elsewhere.
     Limb(Limb),
-    /// The mask reaches farther from the body than clothes, and no limb explains it: background, or a thing held.
+    /// The mask reaches farther from the body than clothes, and no limb explains it: background, or
+    /// a thing held.
     Background,
 }
 
@@ -119,9 +120,10 @@ pub(super) fn parts(body: &BodyModel) -> Vec<Part> {
     Limb::ALL.into_iter().flat_map(|limb| limb.joints().map(|name| part(limb, name))).flatten().collect()
 }
 
-/// Share of the mask beyond close clothes of the body's `outline`, and the fault of a frame whose mask reaches farther
-/// than clothes do. `metre`: pixels of a metre at the body's depth. A limb is elsewhere if that part of the mask lies
-/// where the limb would be, rotated about a joint of its own.
+/// Share of the mask beyond close clothes of the body's `outline`, and the fault of a frame whose
+/// mask reaches farther than clothes do. `metre`: pixels of a metre at the body's depth. A limb is
+/// elsewhere if that part of the mask lies where the limb would be, rotated about a joint of its
+/// own.
 pub(super) fn beyond(view: &View, outline: &[bool], posed: &Posed, parts: &[Part], metre: f32) -> (f32, Option<Fault>) {
     let width = view.camera.width as usize;
     let far = squared_distance(outline, width);
@@ -175,8 +177,8 @@ fn direction(i: usize) -> Vec3 {
     Vec3::new(radius * cos, radius * sin, z)
 }
 
-/// Least lateral jump of the pelvis in multiples of the farthest joint's distance from it, least logarithmic
-/// jump of its depth, least jump of the rotation of half of the joints, radians.
+/// Least lateral jump of the pelvis in multiples of the farthest joint's distance from it, least
+/// logarithmic jump of its depth, least jump of the rotation of half of the joints, radians.
 const LEAST_JUMPS: [f32; 3] = [0.35, 0.25, 0.5];
 /// Least ratios of jumps to the median step.
 const TIMES: [f32; 3] = [8.0, 8.0, 5.0];

@@ -173,7 +173,8 @@ impl View {
         Ok(Self { index, camera, mask, occluder })
     }
 
-    /// Whether the mask, or a known occluder, is at a pixel position, or the position is outside the image.
+    /// Whether the mask, or a known occluder, is at a pixel position, or the position is outside
+    /// the image.
     fn shows(&self, at: Vec2) -> bool {
         let inside = at.cmpge(Vec2::ZERO).all() && at.x < self.camera.width as f32 && at.y < self.camera.height as f32;
         let pixel = at.y as usize * self.camera.width as usize + at.x as usize;

@@ -7,8 +7,8 @@ use glam::{Vec3, Vec4};
 use crate::capture::Light;
 use crate::model::subdivide::Subdivided;
 
-/// Colours of the prior at the vertices of its surface, subdivided until they lie closer than the pixels
-/// of the video, at most twice, and the light that falls on it.
+/// Colours of the prior at the vertices of its surface, subdivided until they lie closer than the
+/// pixels of the video, at most twice, and the light that falls on it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PriorColors {
     /// sRGB under even light, those of the V vertices of the prior first.
@@ -48,8 +48,8 @@ impl PriorColors {
     }
 }
 
-/// Shading of a point of the face with these `corners`, interpolated from its vertices' (V, or empty
-/// for 1; see [`Light::on_surface`]).
+/// Shading of a point of the face with these `corners`, interpolated from its vertices' (V, or
+/// empty for 1; see [`Light::on_surface`]).
 pub(crate) fn shade(shades: &[f32], corners: [u32; 3], barycentric: [f32; 3]) -> f32 {
     if shades.is_empty() {
         return 1.0;

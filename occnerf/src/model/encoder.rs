@@ -15,8 +15,8 @@ use crate::config::{Config, EncodingConfig, Method, SurfaceConfig};
 use crate::model::body::{Body, SurfacePoint, surface_point, surface_point_backward};
 use crate::model::samples::Samples;
 
-/// An encoding of canonical points x̂ (normalised metres) that is defined outside of this crate; see
-/// [`Trainer::with_encoder`](crate::Trainer::with_encoder).
+/// An encoding of canonical points x̂ (normalised metres) that is defined outside of this crate;
+/// see [`Trainer::with_encoder`](crate::Trainer::with_encoder).
 ///
 /// Its parameters are one flat slice, trained at the rate of the hash table. Features are N × F,
 /// a row a point. The same input has to give the same bits on any thread.

@@ -276,8 +276,8 @@ impl Tracer<'_> {
         samples.starts.push(samples.t.len());
     }
 
-    /// The closest point of the posed prior within the live range; `near` is a face that is probably
-    /// close.
+    /// The closest point of the posed prior within the live range; `near` is a face that is
+    /// probably close.
     fn nearest(&self, point: Vec3, near: Option<u32>) -> Option<Nearest> {
         let mesh = &self.surface.mesh;
         // Rounding may put the face itself a hair beyond its own distance.

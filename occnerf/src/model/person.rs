@@ -112,7 +112,8 @@ impl Person {
     /// where it has none.
     ///
     /// # Errors
-    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for a file that is damaged, or of other frames.
+    /// [`Error::Io`], [`Error::Array`] and [`Error::File`] for a file that is damaged, or of other
+    /// frames.
     pub fn restore(run: &Path, mended: Mended, model: &BodyModel) -> Result<Option<Registered>, Error> {
         let (path, Mended { mut capture, mending }) = (run.join(PERSON), mended);
         if !path.is_file() {

@@ -24,8 +24,8 @@ pub(crate) struct Samples {
     pub distance: Vec<f32>,
     /// All levels, finest first; empty where not needed.
     pub neighbours: Vec<u32>,
-    /// Initial colour before the sigmoid and, as w, the weight of the perceptron's output; empty for
-    /// grey and 1.
+    /// Initial colour before the sigmoid and, as w, the weight of the perceptron's output; empty
+    /// for grey and 1.
     pub base: Vec<Vec4>,
 }
 

@@ -22,7 +22,8 @@ use crate::scene::hands::is_arm;
 use crate::scene::prepared::Scene;
 use crate::scene::seen::ColorObservation;
 
-/// Target edge length of the subdivided prior, pixels of the training frames, and most subdivisions.
+/// Target edge length of the subdivided prior, pixels of the training frames, and most
+/// subdivisions.
 const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
 /// Least foreshortening weight of an observation.
@@ -35,9 +36,9 @@ const TOGETHER: usize = 8;
 impl PriorColors {
     /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
     /// or of its clothes if registered, weighted by foreshortening and reliability, under the light
-    /// of the scene if the configuration asks for one. Contaminated edge pixels of masks are left out.
-    /// Vertices that are not observed reliably are completed by inverse distance weighting, other such
-    /// points interpolated from their vertices.
+    /// of the scene if the configuration asks for one. Contaminated edge pixels of masks are left
+    /// out. Vertices that are not observed reliably are completed by inverse distance weighting,
+    /// other such points interpolated from their vertices.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -287,7 +288,8 @@ mod tests {
         compare(&scene, &scene.clothes);
     }
 
-    /// Compares the colours of some places with those that a loop over all pictures and faces finds.
+    /// Compares the colours of some places with those that a loop over all pictures and faces
+    /// finds.
     fn compare(scene: &Scene, clothes: &[f32]) {
         let found = PriorColors::measure(scene).unwrap();
         assert!(found.mesh.times() > 0 && found.colors.len() == found.mesh.anchors.len());
@@ -332,7 +334,8 @@ mod tests {
                 wrong += usize::from(found.seen[v]);
             }
         }
-        // Places that a face all but grazes, or whose pixel is the next, are told differently by f32.
+        // Places that a face all but grazes, or whose pixel is the next, are told differently by
+        // f32.
         assert!(shown > 50 && hidden > 5 && wrong <= 3, "{wrong} wrong of {shown} and {hidden}");
     }
 

@@ -13,7 +13,8 @@ use crate::scene::seen::ColorObservation;
 const REACH: f32 = 0.12;
 /// Least observations of a colour.
 const ENOUGH: usize = 200;
-/// Distance from a hand's vertices, relative to the length of its projection, of pixels that may show it.
+/// Distance from a hand's vertices, relative to the length of its projection, of pixels that may
+/// show it.
 const NEAR: f32 = 0.35;
 /// SMPL's joints that move hands, and forearms and hands.
 const HANDS: std::ops::Range<usize> = 20..24;

@@ -153,8 +153,8 @@ fn erode(set: &[bool], width: usize, radius: f32) -> Vec<bool> {
     })
 }
 
-/// The result of `filter` on the rows and columns within `margin` pixels of the set ones, and the default
-/// elsewhere.
+/// The result of `filter` on the rows and columns within `margin` pixels of the set ones, and the
+/// default elsewhere.
 pub(crate) fn around<T: Copy + Default>(
     set: &[bool],
     width: usize,

@@ -29,8 +29,8 @@ const PAIRS: u64 = 100;
 const ENOUGH: usize = 8;
 /// Level sets around a mask: [`LINES`] outside, the edge, and 4 inside.
 const AROUND: usize = LINES + 5;
-/// Least gradient of the outline relative to the largest, and largest gradient of a level set outside
-/// relative to the outline's.
+/// Least gradient of the outline relative to the largest, and largest gradient of a level set
+/// outside relative to the outline's.
 const NEARLY: f64 = 0.75;
 const RISE: f64 = 0.6;
 /// Passes of growing.
@@ -38,8 +38,8 @@ const PASSES: usize = 3;
 /// Largest distance of grown pixels from the body, metres.
 const NEAR: f32 = 0.1;
 
-/// Erodes or dilates the masks of the training frames to the person's outline, and removes background at
-/// their rims.
+/// Erodes or dilates the masks of the training frames to the person's outline, and removes
+/// background at their rims.
 ///
 /// # Errors
 /// Pictures that cannot be read.
@@ -60,8 +60,8 @@ fn resize(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
     }
 }
 
-/// Removes pixels from the masks that look like the background beside them, which is where neither the person
-/// nor an occluder may be; their share of the masks.
+/// Removes pixels from the masks that look like the background beside them, which is where neither
+/// the person nor an occluder may be; their share of the masks.
 fn leave_out_background(capture: &mut Capture, model: &BodyModel) -> Result<f32, Error> {
     let of_frame = |frame: &mut Frame| -> Result<[usize; 2], Error> {
         let Some(photograph) = frame.source.photograph().transpose()? else { return Ok([0; 2]) };
@@ -79,9 +79,9 @@ fn leave_out_background(capture: &mut Capture, model: &BodyModel) -> Result<f32,
     Ok(found as f32 / all.max(1) as f32)
 }
 
-/// Number of pixels by which the masks are too large; 0 where no level set stands out, or the gradient
-/// does not fall from it towards the mask's edge: photographs are blurred, and the outline of an exact
-/// mask is at its edge.
+/// Number of pixels by which the masks are too large; 0 where no level set stands out, or the
+/// gradient does not fall from it towards the mask's edge: photographs are blurred, and the outline
+/// of an exact mask is at its edge.
 fn excess(frames: &[Frame]) -> Result<i32, Error> {
     let sums = total(frames, |frame| Ok(Some(inner_gradients(&frame.pixels()?))))?;
     let crossed = sums.iter().take_while(|sum| sum.1 >= PAIRS);
@@ -242,13 +242,14 @@ const RIM: f32 = 0.025;
 const LEAST_RIM: usize = 2;
 /// Least distance between the mean colours of background and person beside a pixel.
 const CONTRAST: f32 = 0.15;
-/// Largest distance of a background pixel from the mean colour of the background, also relative to that from
-/// the person's.
+/// Largest distance of a background pixel from the mean colour of the background, also relative to
+/// that from the person's.
 const ALIKE: f32 = 0.1;
 const NEARER: f32 = 0.3;
 
-/// Pixels of a mask with the mean colour of the background beside them, unlike the person's deeper inside,
-/// that such pixels join to the background. `outside`: known background, beside pixels of the mask.
+/// Pixels of a mask with the mean colour of the background beside them, unlike the person's deeper
+/// inside, that such pixels join to the background. `outside`: known background, beside pixels of
+/// the mask.
 fn background(pixels: &Pixels, photograph: &Image, mut outside: Vec<bool>) -> Vec<usize> {
     let (width, height) = (photograph.width as usize, photograph.height as usize);
     let inside: Vec<bool> = pixels.mask.iter().map(|&m| m > 0.5).collect();
@@ -486,8 +487,8 @@ mod tests {
 
     const SIDE: usize = 80;
 
-    /// A light disc before a dark wall with noise of deviation `noise`, and a mask of it that has also the
-    /// pixels of `wall`.
+    /// A light disc before a dark wall with noise of deviation `noise`, and a mask of it that has
+    /// also the pixels of `wall`.
     fn scene(noise: f32, seed: u64, wall: impl Fn(usize, usize) -> bool) -> (Pixels, Image) {
         let mut stream = RandomStream::new(&[seed]);
         let is_person = |x: usize, y: usize| (x as f32 - 40.0).hypot(y as f32 - 40.0) < 25.0;

@@ -39,7 +39,8 @@ impl PreparedFrame {
     /// The picture and its mask.
     ///
     /// # Errors
-    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] for a view without a picture.
+    /// [`Error::Data`] for files that cannot be read; [`Error::Scene`] for a view without a
+    /// picture.
     pub fn pixels(&self) -> Result<Pixels, Error> {
         self.photographed(PixelSource::pixels)
     }
@@ -88,8 +89,8 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// Corrects the masks of a capture, registers its bodies, and prepares it; takes masks and bodies
-    /// as they are for `registration.rounds` of 0.
+    /// Corrects the masks of a capture, registers its bodies, and prepares it; takes masks and
+    /// bodies as they are for `registration.rounds` of 0.
     ///
     /// # Errors
     /// Those of [`Scene::prepare`].
@@ -153,8 +154,8 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Colours of the prior, measured on first use ([`PriorColors::measure`]), or those of a resumed
-    /// run.
+    /// Colours of the prior, measured on first use ([`PriorColors::measure`]), or those of a
+    /// resumed run.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -166,8 +167,8 @@ impl Scene {
         Ok(self.colors.get_or_init(|| measured))
     }
 
-    /// Light of the frames, measured on first use if the configuration asks for one or that of a resumed
-    /// run, reliability of their colours under it, and the colour of the hands.
+    /// Light of the frames, measured on first use if the configuration asks for one or that of a
+    /// resumed run, reliability of their colours under it, and the colour of the hands.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -195,8 +196,8 @@ impl Scene {
         Self { colors: OnceLock::from(colors), lighting: OnceLock::new(), ..self }
     }
 
-    /// Colour observations of the vertices in each training frame, with their depth inside the mask;
-    /// none of held-out frames.
+    /// Colour observations of the vertices in each training frame, with their depth inside the
+    /// mask; none of held-out frames.
     pub(crate) fn seen(&self) -> Result<Vec<Vec<(ColorObservation, usize)>>, Error> {
         let anchors: Vec<Anchor> = (0..self.body.canonical.vertices.len() as u32).map(Anchor::vertex).collect();
         (0..self.train.len()).into_par_iter().map(|frame| self.seen_in(frame, &anchors)).collect()
@@ -254,8 +255,8 @@ impl Scene {
         Ok(())
     }
 
-    /// Share of the training masks' pixels that the prior covers, over up to 32 frames; close to 0 where
-    /// cameras or bodies are wrong.
+    /// Share of the training masks' pixels that the prior covers, over up to 32 frames; close to 0
+    /// where cameras or bodies are wrong.
     ///
     /// # Errors
     /// A picture of more than 16384 pixels a side.
@@ -272,8 +273,8 @@ impl Scene {
         Ok(sum(|count| count.0) / sum(|count| count.1).max(1.0))
     }
 
-    /// Number of training frames in which each vertex of the prior is visible at a subject pixel, by
-    /// ray casting.
+    /// Number of training frames in which each vertex of the prior is visible at a subject pixel,
+    /// by ray casting.
     pub fn vertex_frequencies(&self) -> Result<Vec<u64>, Error> {
         let visible: Result<Vec<Vec<bool>>, Error> = self
             .train

@@ -12,14 +12,15 @@ const BINS: [usize; 2] = [MOST + 1, 5];
 /// First bin of cosines of a frontal colour, and least observations of a bin.
 const FRONTAL: usize = 3;
 const ENOUGH: u32 = 30;
-/// Deviation of deep, frontal colours from the albedo at which frames half disagree. It is 0.02 to 0.03
-/// where registration and masks are exact, up to 0.047 on fine stripes, 0.061 on real video with dirty masks.
+/// Deviation of deep, frontal colours from the albedo at which frames half disagree. It is 0.02 to
+/// 0.03 where registration and masks are exact, up to 0.047 on fine stripes, 0.061 on real video
+/// with dirty masks.
 const DISAGREEMENT: f32 = 0.055;
 /// How sharply frames are told apart there.
 const SHARPNESS: i32 = 12;
 
-/// Inverse variance of colours by depth and slant, relative to that of deep and frontal ones: bodies off
-/// their place and background in masks show at rims.
+/// Inverse variance of colours by depth and slant, relative to that of deep and frontal ones:
+/// bodies off their place and background in masks show at rims.
 pub(crate) struct Reliability {
     /// 1 less the ratio; 0 where there are too few to tell.
     unreliable: [[f32; BINS[1]]; BINS[0]],
@@ -28,8 +29,8 @@ pub(crate) struct Reliability {
 }
 
 impl Reliability {
-    /// Of the colours of frames under a light, with depths in their masks; `views`: posed vertices and centre
-    /// of projection of each frame.
+    /// Of the colours of frames under a light, with depths in their masks; `views`: posed vertices
+    /// and centre of projection of each frame.
     pub fn measure(frames: &[Vec<(ColorObservation, usize)>], views: &[(&[Vec3], Vec3)], light: Light) -> Self {
         let seen = frames.iter().zip(views).flat_map(|(frame, &(vertices, eye))| {
             let cosine =
@@ -72,8 +73,8 @@ impl Reliability {
         [(depth.max(1.0) as usize).min(BINS[0]) - 1, slant.min(BINS[1] - 1)]
     }
 
-    /// Weight of a colour at a depth inside its mask, pixels from 1, and with this cosine between normal
-    /// and view direction: 1 where frames agree.
+    /// Weight of a colour at a depth inside its mask, pixels from 1, and with this cosine between
+    /// normal and view direction: 1 where frames agree.
     pub fn at(&self, depth: f32, cosine: f32) -> f32 {
         let [depth, slant] = Self::bin(depth, cosine);
         1.0 - self.disagreement * self.unreliable[depth][slant]

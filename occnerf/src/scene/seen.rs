@@ -27,8 +27,8 @@ pub(crate) fn dressed(vertices: &[Vec3], normals: &[Vec3], clothes: &[f32]) -> V
 }
 
 /// Colour observations of the points `anchors` of the prior, by ray casting against subject pixels,
-/// each with its depth inside the mask in pixels, from 1. The points lie on the surface of `clothes`
-/// (V), or on the body for empty `clothes`.
+/// each with its depth inside the mask in pixels, from 1. The points lie on the surface of
+/// `clothes` (V), or on the body for empty `clothes`.
 pub(crate) fn seen(
     view: &PosedView,
     pixels: &Pixels,
@@ -135,8 +135,8 @@ fn harmonics(lamp: Vec3, n: Vec3) -> Terms {
     Terms::from([1.0, along_x, along_y, along_z, x * y, y * z, z * x, x * x - y * y, z * z - 1.0 / 3.0])
 }
 
-/// Least-squares light for the albedo of these sums (see [`albedo`]), with a free third band; `None`
-/// for a singular system.
+/// Least-squares light for the albedo of these sums (see [`albedo`]), with a free third band;
+/// `None` for a singular system.
 fn slope<'a>(seen: impl Iterator<Item = &'a ColorObservation>, sums: &[(Vec3, f32)], lamp: Vec3) -> Option<Vec3> {
     let (mut matrix, mut vector, mut total) = (SMatrix::<f64, 9, 9>::zeros(), Terms::zeros(), 0.0);
     for (v, color, normal) in seen {

@@ -62,7 +62,8 @@ pub(crate) struct RayGroup {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct StepOptions {
     pub march: MarchOptions,
-    /// Whether rays at unknown pixels evaluate only samples inside the prior: others have no gradient.
+    /// Whether rays at unknown pixels evaluate only samples inside the prior: others have no
+    /// gradient.
     pub skips_unknown: bool,
 }
 
@@ -78,8 +79,9 @@ pub(crate) struct Step<'a> {
 }
 
 impl Step<'_> {
-    /// Traces, encodes, evaluates and composites the rays of a group. Samples outside the prior at an
-    /// unknown pixel are dead: no photometric term reads that ray, and completeness only the inside.
+    /// Traces, encodes, evaluates and composites the rays of a group. Samples outside the prior at
+    /// an unknown pixel are dead: no photometric term reads that ray, and completeness only the
+    /// inside.
     pub fn forward(&self, group: &mut RayGroup) {
         let Self { model, frame, batch, .. } = *self;
         let config = &model.config;

@@ -71,8 +71,9 @@ impl<'a> Trainer<'a> {
         Ok(Self { scene, model, optimiser, lpips: None, buffers })
     }
 
-    /// Feeds the perceptron with the features of `encoder` in place of the method's, and begins at step 0.
-    /// A checkpoint does not hold the encoder: such a run cannot be resumed, nor its model loaded.
+    /// Feeds the perceptron with the features of `encoder` in place of the method's, and begins at
+    /// step 0. A checkpoint does not hold the encoder: such a run cannot be resumed, nor its model
+    /// loaded.
     ///
     /// # Panics
     /// With the surface term, whose vertices no encoder of points encodes.
@@ -240,8 +241,8 @@ fn reduce(
 }
 
 impl<'a> Trainer<'a> {
-    /// Writes the model and the state of training. An old file survives until the new one is complete
-    /// and on the disk.
+    /// Writes the model and the state of training. An old file survives until the new one is
+    /// complete and on the disk.
     ///
     /// # Errors
     /// [`Error::Diverged`] where a number is not finite: the old file stays; [`Error::Io`].
@@ -270,10 +271,12 @@ impl<'a> Trainer<'a> {
         Ok(())
     }
 
-    /// Resumes from a checkpoint of the same scene and configuration; the number of steps may differ.
+    /// Resumes from a checkpoint of the same scene and configuration; the number of steps may
+    /// differ.
     ///
     /// # Errors
-    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for a damaged checkpoint, or one of another scene.
+    /// [`Error::Io`]; [`Error::Array`] and [`Error::File`] for a damaged checkpoint, or one of
+    /// another scene.
     pub fn resume(scene: &'a Scene, path: &Path) -> Result<Self, Error> {
         let bytes = read(path)?;
         let contents = parse(path, &bytes)?;

@@ -10,7 +10,8 @@ use smpl::{BoneNames, SparseRows, skeleton};
 use testkit::mesh::{TriMesh, open_grid, torus};
 use testkit::strategy;
 
-/// The mesh with four charts seen along ±z, cut at x = 0 too: vertices on seams have a copy a chart.
+/// The mesh with four charts seen along ±z, cut at x = 0 too: vertices on seams have a copy a
+/// chart.
 fn charted(mesh: &TriMesh) -> Avatar {
     let mut copies = HashMap::new();
     let (mut vertices, mut uvs, mut faces) = (Vec::new(), Vec::new(), Vec::new());

@@ -14,8 +14,8 @@ const MAX_PIPED_BYTES: u64 = 1 << 28;
 /// removes.
 const PREFIX: &str = ".unfinished-";
 
-/// Reads a file of at most `limit` bytes; a device or a pipe, whose reported length means nothing, of
-/// at most 256 MiB too.
+/// Reads a file of at most `limit` bytes; a device or a pipe, whose reported length means nothing,
+/// of at most 256 MiB too.
 ///
 /// ```
 /// # let path = std::env::temp_dir().join("array-files-bounded.txt");
@@ -54,8 +54,8 @@ pub fn read_file(path: &Path) -> Result<Vec<u8>, Error> {
     Ok(bytes)
 }
 
-/// The text of a file as editors on any system write it: UTF-8, with a byte-order mark or without, or
-/// UTF-16 with one; line ends of `\r\n` and `\r` become `\n`. What is not valid becomes U+FFFD.
+/// The text of a file as editors on any system write it: UTF-8, with a byte-order mark or without,
+/// or UTF-16 with one; line ends of `\r\n` and `\r` become `\n`. What is not valid becomes U+FFFD.
 ///
 /// ```
 /// use array_files::decode_text;

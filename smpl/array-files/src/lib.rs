@@ -1,6 +1,6 @@
 //! Readers of the files in which Python programs keep arrays: numpy's `.npy` and `.npz`, pickles,
-//! joblib's compressed pickles and PyTorch's `torch.save`; a writer of `.npz`; safetensors, both ways;
-//! and what every file needs, bounded reading and atomic replacement.
+//! joblib's compressed pickles and PyTorch's `torch.save`; a writer of `.npz`; safetensors, both
+//! ways; and what every file needs, bounded reading and atomic replacement.
 //!
 //! ```
 //! use array_files::npz::{self, Npz};
@@ -25,8 +25,8 @@
 //!   global is an error, and nothing is executed.
 //! - Sizes in headers are not trusted: memory is bounded by the bytes of the file and by the limits
 //!   stated at each reader.
-//! - Errors name the file, the array and, for pickles, the offset of the opcode. Readers of bytes in
-//!   memory take a name to be used as the file's.
+//! - Errors name the file, the array and, for pickles, the offset of the opcode. Readers of bytes
+//!   in memory take a name to be used as the file's.
 
 mod array;
 mod element;

@@ -143,7 +143,8 @@ impl Npz {
     }
 }
 
-/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez`. Equal arrays give equal bytes.
+/// Writes an uncompressed `.npz` of named arrays, as numpy's `savez`. Equal arrays give equal
+/// bytes.
 ///
 /// # Errors
 /// [`Error::Io`]; [`Error::Invalid`] for a shape that does not match the number of values;

@@ -184,8 +184,8 @@ impl<'a> Tensors<'a> {
         self.tensors.tensor(key).ok().map(|view| view.shape().to_vec())
     }
 
-    /// The values of the tensor `key`, row-major, if its elements are of type `T` and its shape fits
-    /// `pattern` (`None`: any extent).
+    /// The values of the tensor `key`, row-major, if its elements are of type `T` and its shape
+    /// fits `pattern` (`None`: any extent).
     ///
     /// # Errors
     /// [`Error::Invalid`] for a missing tensor and one of another type or shape.

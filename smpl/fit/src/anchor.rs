@@ -75,9 +75,9 @@ const NEAR: [(&str, usize, [f32; 3]); 4] = [
 /// Distance of SAM 3D Body's hips in thigh lengths (0.32 to 0.37 in four people).
 const HIPS: f32 = 0.35;
 
-/// Names of joint sets, and their points in order: landmarks, numbers of SMPL's joints, means of two
-/// joints (`16+17`), points an eighth of the way from one joint to another (`20>22`), and `-` for points
-/// without a place on the body; joints from 24 are SMPL-X's fingers.
+/// Names of joint sets, and their points in order: landmarks, numbers of SMPL's joints, means of
+/// two joints (`16+17`), points an eighth of the way from one joint to another (`20>22`), and `-`
+/// for points without a place on the body; joints from 24 are SMPL-X's fingers.
 const SETS: [(&str, &str); 5] = [
     ("coco17", "nose - - lear rear 16 17 18 19 20 21 1 2 4 5 7 8"),
     ("openpose25", "nose 16+17 17 19 21 16 18 20 1+2 2 5 8 1 4 7 - - rear lear ltoe lsmall lheel rtoe rsmall rheel"),
@@ -98,8 +98,8 @@ pub fn joint_sets() -> [&'static str; SETS.len()] {
     SETS.map(|(name, _)| name)
 }
 
-/// The points of a joint set in its order, on a body with SMPL's first 24 joints; `None` for points that
-/// the body does not have. `None` for an unknown name or a body with fewer joints.
+/// The points of a joint set in its order, on a body with SMPL's first 24 joints; `None` for points
+/// that the body does not have. `None` for an unknown name or a body with fewer joints.
 ///
 /// - `coco17`: COCO's key points (also ViTPose, RTMPose);
 /// - `openpose25`: OpenPose's BODY_25;

@@ -1,5 +1,5 @@
-//! Linear systems of all frames: dense blocks on the diagonal, and diagonal blocks between a frame and
-//! the two after it.
+//! Linear systems of all frames: dense blocks on the diagonal, and diagonal blocks between a frame
+//! and the two after it.
 
 use nalgebra::{DMatrix, DVector};
 
@@ -87,7 +87,8 @@ impl Band {
     }
 }
 
-/// The inverse of a symmetric matrix by halves, most of it products; `None` unless positive definite.
+/// The inverse of a symmetric matrix by halves, most of it products; `None` unless positive
+/// definite.
 fn inverse(matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
     let (n, half) = (matrix.nrows(), matrix.nrows() / 2);
     if n <= 16 {

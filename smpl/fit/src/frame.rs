@@ -5,8 +5,8 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::skeleton::{Shape, Skeleton, State, log, log_derivative};
 
-/// Standard deviation of the prior of a joint's rotation, and of those of spine, neck and collars, on which
-/// points are few, radians.
+/// Standard deviation of the prior of a joint's rotation, and of those of spine, neck and collars,
+/// on which points are few, radians.
 const PRIOR: f64 = 1.0;
 const TRUNK: f64 = 0.6;
 /// Joints of SMPL's feet.
@@ -48,8 +48,8 @@ fn robust(square: f64) -> (f64, f64) {
     (0.5 * scale * (square / scale).ln_1p(), 1.0 / (1.0 + square / scale))
 }
 
-/// Prior and limits of a joint: cost, and residuals with their derivatives by the rotation vector, to
-/// call `add` with.
+/// Prior and limits of a joint: cost, and residuals with their derivatives by the rotation vector,
+/// to call `add` with.
 fn held(skeleton: &Skeleton, joint: usize, turn: DQuat, mut add: impl FnMut(DMat3, DVec3)) -> f64 {
     if skeleton.parents[joint].is_none() {
         return 0.0;

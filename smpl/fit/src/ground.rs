@@ -88,8 +88,9 @@ pub struct Grounded {
 ///
 /// The floor is a plane fitted to the lowest places of the feet; the world is turned until it is
 /// level. Heels and balls of the feet stand while they are slow and low. Place and legs are then
-/// corrected by least squares over all frames: standing parts stay at their mean place on the floor,
-/// everything else where it was, nothing is below the floor, and corrections are smooth in time.
+/// corrected by least squares over all frames: standing parts stay at their mean place on the
+/// floor, everything else where it was, nothing is below the floor, and corrections are smooth in
+/// time.
 ///
 /// ```
 /// use glam::Vec3;

@@ -1,8 +1,8 @@
 //! Poses, place and shape of a body from 3-D points of every frame.
 //!
-//! [`fit`] takes any [`BodyModel`], measured points of T frames, and for each point its [`Anchor`] on the
-//! body; [`joint_set`] has those of common sets of key points. [`ground`] stops the feet of a motion
-//! from sliding.
+//! [`fit`] takes any [`BodyModel`], measured points of T frames, and for each point its [`Anchor`]
+//! on the body; [`joint_set`] has those of common sets of key points. [`ground`] stops the feet of
+//! a motion from sliding.
 //!
 //! ```
 //! use glam::Vec3;
@@ -22,16 +22,17 @@
 //! ```
 //!
 //! # Method
-//! Levenberg–Marquardt with analytic derivatives through the kinematic tree. Points have Cauchy's loss
-//! at the noise measured from their second differences in time; rotations a weak prior at rest, and
-//! limits where the tree is SMPL's; rotations and place small second differences in time. Betas have
-//! unit variance and are found from at most 64 frames and the first 128, poses then in windows of 128
-//! frames, each by one block-pentadiagonal system, so that hidden joints follow their neighbours in
-//! time. The first guess solves Procrustes' problem of one joint after the other.
+//! Levenberg–Marquardt with analytic derivatives through the kinematic tree. Points have Cauchy's
+//! loss at the noise measured from their second differences in time; rotations a weak prior at
+//! rest, and limits where the tree is SMPL's; rotations and place small second differences in time.
+//! Betas have unit variance and are found from at most 64 frames and the first 128, poses then in
+//! windows of 128 frames, each by one block-pentadiagonal system, so that hidden joints follow
+//! their neighbours in time. The first guess solves Procrustes' problem of one joint after the
+//! other.
 //!
 //! # Conventions
-//! Metres, radians; points and [`Placement::Pelvis`](smpl::Placement) in one right-handed space of any
-//! axes. Arithmetic is `f64` and independent of the number of threads.
+//! Metres, radians; points and [`Placement::Pelvis`](smpl::Placement) in one right-handed space of
+//! any axes. Arithmetic is `f64` and independent of the number of threads.
 
 mod anchor;
 mod band;
@@ -90,8 +91,8 @@ pub struct Fitted {
     pub betas: Vec<f32>,
     /// One a frame.
     pub frames: Vec<FittedFrame>,
-    /// Standard deviation of a coordinate of a point, metres, as measured between frames: 2 mm to 10 cm,
-    /// and 1 cm where fewer than three frames are at hand.
+    /// Standard deviation of a coordinate of a point, metres, as measured between frames: 2 mm to
+    /// 10 cm, and 1 cm where fewer than three frames are at hand.
     pub noise: f32,
 }
 
@@ -135,8 +136,8 @@ pub struct FittedFrame {
 #[error("{0}")]
 pub struct FitError(String);
 
-/// Fits a body to `seen`, (T, P) points, P of each frame in the order of `anchors`. Points that are not
-/// finite, or farther than 100 km, are missing.
+/// Fits a body to `seen`, (T, P) points, P of each frame in the order of `anchors`. Points that are
+/// not finite, or farther than 100 km, are missing.
 ///
 /// The body's first ten betas are found; a rigged character gets some by
 /// [`BodyModel::with_limb_lengths`].

@@ -91,8 +91,9 @@ fn differences(skeleton: &Skeleton, states: &[State]) -> Vec<DVector<f64>> {
     states.windows(2).map(|pair| between(skeleton, &pair[0], &pair[1])).collect()
 }
 
-/// Adds smoothness to the normal equations and returns their blocks beside the diagonal. The derivative
-/// of a difference of rotations is taken as ±1: between frames of a video joints turn little.
+/// Adds smoothness to the normal equations and returns their blocks beside the diagonal. The
+/// derivative of a difference of rotations is taken as ±1: between frames of a video joints turn
+/// little.
 fn smoothed(skeleton: &Skeleton, states: &[State], normals: &mut [Normal]) -> Beside {
     let motion = differences(skeleton, states);
     let weights = stiffness(skeleton);

@@ -11,8 +11,8 @@ pub(crate) type Range = [DVec3; 2];
 /// Parents of SMPL's body joints, which SMPL-H and SMPL-X share.
 const SMPL: [usize; 21] = [0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19];
 
-/// Limits of SMPL's joints on the left and along the spine, generous; those of the right are mirrored.
-/// Knees and elbows bend one way.
+/// Limits of SMPL's joints on the left and along the spine, generous; those of the right are
+/// mirrored. Knees and elbows bend one way.
 const LIMITS: [(usize, Range); 12] = [
     (1, [DVec3::new(-2.5, -1.2, -1.0), DVec3::new(1.2, 1.2, 1.4)]),
     (3, [DVec3::splat(-0.7), DVec3::splat(0.7)]),
@@ -33,15 +33,16 @@ const FREE: f64 = 2.4;
 
 /// Kinematic tree with points on its bones; offsets and arms are linear in the betas.
 ///
-/// A point is Σ share · t_bone + R_bone · arm over its parts, (R, t) the joint frames: skinning without
-/// pose blend shapes.
+/// A point is Σ share · t_bone + R_bone · arm over its parts, (R, t) the joint frames: skinning
+/// without pose blend shapes.
 pub(crate) struct Skeleton {
     pub parents: Vec<Option<usize>>,
     pub ranges: Vec<Range>,
     /// The mean shape, and its derivative with respect to each beta.
     pub mean: Shape,
     pub directions: Vec<Shape>,
-    /// Column of the first of three unknowns of each joint's rotation; `None` where it moves no point.
+    /// Column of the first of three unknowns of each joint's rotation; `None` where it moves no
+    /// point.
     pub columns: Vec<Option<usize>>,
     /// Unknowns of a frame: place of the root, then rotations.
     pub unknowns: usize,

@@ -1,5 +1,5 @@
-//! First guesses of a frame without a neighbour: Procrustes' problem of one joint after the other, within
-//! limits.
+//! First guesses of a frame without a neighbour: Procrustes' problem of one joint after the other,
+//! within limits.
 
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::Matrix3;
@@ -12,13 +12,14 @@ pub(crate) const LEAST: usize = 4;
 const POINT: f64 = 0.03;
 /// Least middle of a joint's limits that makes it a hinge, radians.
 const HINGE: f64 = 0.9;
-/// Squared distance of a guess from bent joints, over that from straight ones, below which it is taken.
+/// Squared distance of a guess from bent joints, over that from straight ones, below which it is
+/// taken.
 const BETTER: f64 = 0.5;
 /// Rounds of all joints.
 const SWEEPS: usize = 8;
 
-/// A first guess for the points of a frame, at least [`LEAST`] of them finite. From straight elbows and knees a sharp
-/// bend is found about another axis: then the guess begins with half bent ones.
+/// A first guess for the points of a frame, at least [`LEAST`] of them finite. From straight elbows
+/// and knees a sharp bend is found about another axis: then the guess begins with half bent ones.
 pub(crate) fn start(skeleton: &Skeleton, shape: &Shape, seen: &[DVec3]) -> State {
     let square = |state: &State| {
         let points = skeleton.points(shape, &skeleton.frames(shape, state));
@@ -85,8 +86,8 @@ fn swept(skeleton: &Skeleton, shape: &Shape, seen: &[DVec3], mut state: State) -
     state
 }
 
-/// The rotation that turns each first vector of weighted pairs best to the second, and its axes best to
-/// those of `prior`, a rotation times its weight.
+/// The rotation that turns each first vector of weighted pairs best to the second, and its axes
+/// best to those of `prior`, a rotation times its weight.
 fn rotation(pairs: impl Iterator<Item = (f64, DVec3, DVec3)>, prior: DMat3) -> DMat3 {
     let mut sum = prior;
     for (weight, from, to) in pairs {

@@ -14,8 +14,8 @@ const STRONG: f64 = 0.5;
 const SAMPLE: usize = 32;
 const NOISE: f64 = 0.05;
 
-/// Exchanges left and right where they jump between frames, and in all frames where the body then fits
-/// much better; says in which.
+/// Exchanges left and right where they jump between frames, and in all frames where the body then
+/// fits much better; says in which.
 pub(crate) fn undo(skeleton: &Skeleton, seen: &mut [Vec<DVec3>]) -> Vec<bool> {
     let exchanged = |frame: &[DVec3]| -> Vec<DVec3> { skeleton.opposite.iter().map(|&i| frame[i]).collect() };
     let mut swapped = vec![false; seen.len()];

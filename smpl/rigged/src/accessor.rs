@@ -203,7 +203,8 @@ impl<'a> Source<'a> {
         Ok(out)
     }
 
-    /// Finite floats; integers if normalised, or where the document quantises (KHR_mesh_quantization).
+    /// Finite floats; integers if normalised, or where the document quantises
+    /// (KHR_mesh_quantization).
     pub(crate) fn floats<const N: usize>(&self, index: Index<Accessor>, place: &str) -> Result<Vec<[f32; N]>, Error> {
         let quantized = self.root.extensions_required.iter().any(|name| name == "KHR_mesh_quantization");
         self.elements(index, place, |kind, normalized, bytes| {

@@ -18,7 +18,8 @@ pub struct Character {
     pub vertices: Vec<Vec3>,
     /// Texture coordinates, (V), v downward; zero for primitives without, empty if none has any.
     pub uvs: Vec<Vec2>,
-    /// Index into [`Character::textures`] of each vertex, (V); `None` without texture or coordinates.
+    /// Index into [`Character::textures`] of each vertex, (V); `None` without texture or
+    /// coordinates.
     pub texture_of: Vec<Option<u32>>,
     /// Factor of the base colour, linear, (V): the material's times that of the vertex, in [0, 1].
     pub tints: Vec<Vec3>,
@@ -77,8 +78,8 @@ impl Character {
         self.joint_nodes.len()
     }
 
-    /// Parent of each joint, (J): the joint of the nearest ancestor node that is one. Of joints that
-    /// share a node, the first is the parent of the others.
+    /// Parent of each joint, (J): the joint of the nearest ancestor node that is one. Of joints
+    /// that share a node, the first is the parent of the others.
     pub fn joint_parents(&self) -> Vec<Option<usize>> {
         let mut first = vec![None; self.nodes.len()];
         for (joint, &node) in self.joint_nodes.iter().enumerate().rev() {

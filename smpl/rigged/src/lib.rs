@@ -15,9 +15,9 @@
 //! assert_eq!(character.rest().vertices[1], glam::Vec3::new(1.0, 1.0, 0.0));
 //! ```
 //!
-//! Damaged and hostile files are errors that name the part of the document: every index and range is
-//! checked before it is used, a document may decode to 256 MiB and read 512 MiB of other files, none
-//! of them outside its folder. Metres, y up, as in glTF.
+//! Damaged and hostile files are errors that name the part of the document: every index and range
+//! is checked before it is used, a document may decode to 256 MiB and read 512 MiB of other files,
+//! none of them outside its folder. Metres, y up, as in glTF.
 
 mod accessor;
 mod character;

@@ -94,7 +94,8 @@ const NOT_READ: &str = "which is not read (gltf-transform copy decodes it)";
 const UNREAD: [&str; 4] = ["KHR_draco_mesh_compression", "KHR_texture_basisu", "EXT_texture_webp", INSTANCES];
 const INSTANCES: &str = "EXT_mesh_gpu_instancing";
 
-/// The document. Channels without a node, which glTF leaves to extensions, are dropped; scenes may be empty.
+/// The document. Channels without a node, which glTF leaves to extensions, are dropped; scenes may
+/// be empty.
 fn document(json: &[u8]) -> Result<Root, serde_json::Error> {
     let first = match gltf::json::deserialize::from_slice(json) {
         Ok(root) => return Ok(root),

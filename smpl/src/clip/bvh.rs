@@ -61,8 +61,8 @@ impl Bvh {
     ///
     /// # Errors
     /// [`Error::Io`]; [`Error::Invalid`] with the line, for broken hierarchies, numbers that are
-    /// none, not finite or beyond 10⁶, more or fewer values than frames times channels, more than 1024
-    /// joints or 2²⁴ rotations, and a skeleton without extent.
+    /// none, not finite or beyond 10⁶, more or fewer values than frames times channels, more than
+    /// 1024 joints or 2²⁴ rotations, and a skeleton without extent.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let text = decode_text(&read_file(path)?);
         Parser { file: path.display().to_string(), words: words(&text), line: 1 }.parse()
@@ -72,8 +72,8 @@ impl Bvh {
     /// rests at the origin. Names lose their white space.
     ///
     /// # Errors
-    /// [`Error::Invalid`] for a skeleton whose joints do not come after their parents, or of another
-    /// number of joints than the motion's; [`Error::Io`].
+    /// [`Error::Invalid`] for a skeleton whose joints do not come after their parents, or of
+    /// another number of joints than the motion's; [`Error::Io`].
     pub fn save(&self, path: &Path) -> Result<(), Error> {
         let (file, j) = (path.display().to_string(), self.skeleton.len());
         let ordered = |(at, joint): (usize, &Joint)| joint.parent.map_or(at == 0, |parent| usize::from(parent) < at);
@@ -400,11 +400,11 @@ impl<'a> Roles<'a> {
 }
 
 impl Bvh {
-    /// The motion for the skeleton `to`, which rests y up facing +z. Joints correspond by the names of
-    /// SMPL, Mixamo, CMU, VRM, Unreal, MakeHuman and Biped rigs; they take the orientation of their
-    /// counterparts, corrected by the directions of the limbs at rest; all others follow their
-    /// parents. Translations are scaled by the lengths of the legs. A skeleton of the same names
-    /// takes the rotations and translations as they are. The world's axes stay.
+    /// The motion for the skeleton `to`, which rests y up facing +z. Joints correspond by the names
+    /// of SMPL, Mixamo, CMU, VRM, Unreal, MakeHuman and Biped rigs; they take the orientation of
+    /// their counterparts, corrected by the directions of the limbs at rest; all others follow
+    /// their parents. Translations are scaled by the lengths of the legs. A skeleton of the same
+    /// names takes the rotations and translations as they are. The world's axes stay.
     ///
     /// # Errors
     /// What one of the skeletons lacks: hips, upper or lower arms or legs, or their lengths.

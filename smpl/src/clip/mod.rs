@@ -51,11 +51,11 @@ pub struct MotionClip {
 }
 
 impl MotionClip {
-    /// Reads an `.npz` as in AMASS (156 columns for SMPL-H, 165 for SMPL-X), which is z up: rotations
-    /// `poses` (T, 3J) or (T, J, 3), or, of the body, `root_orient` and `pose_body`, or
+    /// Reads an `.npz` as in AMASS (156 columns for SMPL-H, 165 for SMPL-X), which is z up:
+    /// rotations `poses` (T, 3J) or (T, J, 3), or, of the body, `root_orient` and `pose_body`, or
     /// `global_orient` and `body_pose`; translations `trans` or `transl` (T, 3); one of `fps`,
-    /// `mocap_framerate` and `mocap_frame_rate`, without which [`MotionClip::ASSUMED_FPS`] is taken.
-    /// Other arrays are ignored.
+    /// `mocap_framerate` and `mocap_frame_rate`, without which [`MotionClip::ASSUMED_FPS`] is
+    /// taken. Other arrays are ignored.
     ///
     /// # Errors
     /// Any [`Error`] of arrays; [`Error::Invalid`] without frames, for a rate that is not positive,

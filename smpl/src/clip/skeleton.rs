@@ -51,8 +51,8 @@ pub struct Joint {
 /// Parents of SMPL's 24 joints; its successors share the first 22.
 const SMPL_PARENTS: [usize; 24] = [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21];
 
-/// Joints of a body model's `parents` at positions `rest`, (J). Joints of the trees of SMPL, SMPL-H and
-/// SMPL-X have names of the scheme, all others `joint_07`.
+/// Joints of a body model's `parents` at positions `rest`, (J). Joints of the trees of SMPL, SMPL-H
+/// and SMPL-X have names of the scheme, all others `joint_07`.
 ///
 /// ```
 /// use smpl::{BodyModel, BoneNames, skeleton};
@@ -229,7 +229,8 @@ fn finger(base: &str) -> Option<usize> {
     Some(3 * at + segment)
 }
 
-/// Left is 0 and right is 1; and the rest of the name in small letters, without prefixes of schemes.
+/// Left is 0 and right is 1; and the rest of the name in small letters, without prefixes of
+/// schemes.
 fn side_and_base(name: &str) -> (Option<usize>, String) {
     let name = name.rsplit(':').next().unwrap_or(name).to_ascii_lowercase();
     let prefixes = ["mixamorig", "bip001", "bip01", "j_bip_c_", "j_bip_"];

@@ -172,8 +172,8 @@ impl SurfaceMotion {
     /// rigid bones in equal parts reach it at a relative turn of 154°.
     const MIN_DETERMINANT: f32 = 0.05;
 
-    /// Maps `point`, whose nearest surface point is `nearest`: x̂ = (Σ w_i A_i)⁻¹ x − B_P, with weights
-    /// w and pose offset B_P interpolated on the face.
+    /// Maps `point`, whose nearest surface point is `nearest`: x̂ = (Σ w_i A_i)⁻¹ x − B_P, with
+    /// weights w and pose offset B_P interpolated on the face.
     ///
     /// `None` (dead) where the likelihood is 0, and for anything not finite.
     ///

@@ -21,8 +21,8 @@ const ACROSS: f32 = 0.09;
 /// Motion field of learnable weights on a grid in canonical space.
 ///
 /// K + 1 channels, one per joint and the background last, on `resolution`³ samples that span `min`
-/// to `max` with samples on the faces of the box. Layout of every array: (K+1, n, n, n) for channel,
-/// z, y, x.
+/// to `max` with samples on the faces of the box. Layout of every array: (K+1, n, n, n) for
+/// channel, z, y, x.
 ///
 /// The prior has holes: Σ w is about 0.9 in the middle of a thigh and a few percent at knees and
 /// elbows, in the canonical pose already. There f, and with it the opacity, starts low, and limbs
@@ -324,7 +324,8 @@ impl Gaussian {
     }
 }
 
-/// Mean of the vertices weighted by their skinning weight of `joint`; the joint itself if all are 0.
+/// Mean of the vertices weighted by their skinning weight of `joint`; the joint itself if all are
+/// 0.
 fn own_centre(model: &BodyModel, shaped: &Shaped, joint: usize) -> Vec3 {
     let (mut sum, mut total) = (Vec3::ZERO, 0.0);
     for (v, &vertex) in shaped.vertices.iter().enumerate() {

@@ -315,8 +315,8 @@ fn signs_and_distances_of_the_open_body_equal_brute_force() {
     }
 }
 
-/// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second at
-/// most, where pairs of equals were joined one a pass.
+/// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second
+/// at most, where pairs of equals were joined one a pass.
 #[test]
 fn a_tree_of_equal_faces_is_built_in_no_time() {
     let begun = std::time::Instant::now();

@@ -24,8 +24,8 @@ pub struct Section<'a> {
     pub charts: &'a [PathBuf],
 }
 
-/// Captures that settings were chosen on, and names that go on with a dash; `zju_demo` shows the person
-/// of `humannerf_demo`.
+/// Captures that settings were chosen on, and names that go on with a dash; `zju_demo` shows the
+/// person of `humannerf_demo`.
 const TUNING: [&str; 3] = ["demo", "humannerf_demo", "zju_demo"];
 
 /// What figures on a scene, by its name, speak for.
@@ -38,7 +38,8 @@ pub fn set_of(scene: &str) -> &'static str {
     }
 }
 
-/// Puts a section into tests/lab/RESULTS.md, with the command, commit and machine that it comes from.
+/// Puts a section into tests/lab/RESULTS.md, with the command, commit and machine that it comes
+/// from.
 pub fn publish(section: &Section<'_>) -> Result<()> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR"));
     let document = folder.join("RESULTS.md");

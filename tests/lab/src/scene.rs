@@ -43,9 +43,10 @@ pub struct Corruption {
     /// The simulated obstacle before the training camera of raw ZJU-MoCap. `None`: what
     /// `occlusion.json` says, or the default [`Obstacle`] where there is none.
     pub occlusion: Option<Obstacle>,
-    /// The open body in place of the capture's, which has SMPL's joints or is a character's: at 0 in its mean
-    /// shape, with the capture's angles; else fitted to SAM 3D Body's key points of the capture's body, and to vertices if
-    /// its mesh is the same, each coordinate with normal noise of this standard deviation, in millimetres.
+    /// The open body in place of the capture's, which has SMPL's joints or is a character's: at 0
+    /// in its mean shape, with the capture's angles; else fitted to SAM 3D Body's key points of the
+    /// capture's body, and to vertices if its mesh is the same, each coordinate with normal noise
+    /// of this standard deviation, in millimetres.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub open_body: Option<f32>,
     /// Errors of priors and masks.
@@ -127,8 +128,8 @@ fn put_open_body(capture: &mut Capture, model: &mut BodyModel, noise: f32, names
     Ok(())
 }
 
-/// Puts the open body in place of a character: the shape that fits its joints by their names, with the
-/// character's angles or, with noise, fitted ones.
+/// Puts the open body in place of a character: the shape that fits its joints by their names, with
+/// the character's angles or, with noise, fitted ones.
 fn retarget(capture: &mut Capture, model: &mut BodyModel, noise: f32, open: BodyModel, names: &[String]) -> Result<()> {
     let smpl = BoneNames::Smpl.of_body(open.num_joints());
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
@@ -233,9 +234,9 @@ pub struct SceneArguments {
     #[command(flatten)]
     #[serde(flatten)]
     obstacle: ObstacleArguments,
-    /// Put the open body in place of the capture's: 0 with the capture's angles in its mean shape, else fitted
-    /// to SAM 3D Body's key points (of a character, its joints) with noise of this standard deviation, in
-    /// millimetres
+    /// Put the open body in place of the capture's: 0 with the capture's angles in its mean shape,
+    /// else fitted to SAM 3D Body's key points (of a character, its joints) with noise of this
+    /// standard deviation, in millimetres
     #[arg(long, value_name = "MM")]
     open_body: Option<f32>,
     /// Make the prior and the masks as wrong as something makes them; the options below change
@@ -270,8 +271,8 @@ pub struct SceneArguments {
     /// none]
     #[arg(long, value_name = "PIXELS")]
     wrong_keypoints: Option<f32>,
-    /// Blur, exposure, a backdrop with pieces of it in the training masks, feet cut off, a thing that is
-    /// held [default: false]
+    /// Blur, exposure, a backdrop with pieces of it in the training masks, feet cut off, a thing
+    /// that is held [default: false]
     #[arg(long, value_name = "BOOL")]
     wrong_pictures: Option<bool>,
     /// Another draw of these errors [default: 0]
@@ -282,9 +283,9 @@ pub struct SceneArguments {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum WrongName {
-    /// What cameras, estimators and segmenters make of a real video: poses by 2.5°, 1 cm, depth by 2 %,
-    /// limbs by 2.5 %, shape by 0.5, key points by 1.5 pixels, ragged masks with the backdrop in them,
-    /// blur.
+    /// What cameras, estimators and segmenters make of a real video: poses by 2.5°, 1 cm, depth by
+    /// 2 %, limbs by 2.5 %, shape by 0.5, key points by 1.5 pixels, ragged masks with the backdrop
+    /// in them, blur.
     Real,
 }
 

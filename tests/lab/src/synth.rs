@@ -64,7 +64,8 @@ pub struct SynthArguments {
     /// Replace what the same command wrote to --out earlier
     #[arg(long)]
     force: bool,
-    /// Write no body.safetensors: for the demo of xtask, whose program has the embedded person's body
+    /// Write no body.safetensors: for the demo of xtask, whose program has the embedded person's
+    /// body
     #[arg(long)]
     no_body: bool,
     /// Layout of the files
@@ -87,8 +88,8 @@ pub struct SynthArguments {
     /// Views kept back show every n-th frame [default: 10]
     #[arg(long, value_name = "N")]
     eval_every: Option<usize>,
-    /// Motion capture (.npz with poses, trans, fps, or .bvh), for the embedded person or joints with
-    /// MakeHuman's, Mixamo's, Unreal's or SMPL's names [default: a walk; a character's first
+    /// Motion capture (.npz with poses, trans, fps, or .bvh), for the embedded person or joints
+    /// with MakeHuman's, Mixamo's, Unreal's or SMPL's names [default: a walk; a character's first
     /// animation]
     #[arg(long, value_name = "CLIP")]
     motion: Option<PathBuf>,
@@ -110,7 +111,8 @@ pub struct SynthArguments {
     /// Strength of the light from one side; at 0 as much comes from everywhere [default: 1]
     #[arg(long, value_name = "0 to 1")]
     lamp: Option<f32>,
-    /// What the embedded person wears: a skirt and loose hair are no displacement of the body's surface
+    /// What the embedded person wears: a skirt and loose hair are no displacement of the body's
+    /// surface
     #[arg(long, default_value = "plain", conflicts_with = "character")]
     outfit: OutfitName,
     /// The embedded person's hands are fists, the body's stay flat
@@ -204,7 +206,8 @@ pub fn synth(arguments: &SynthArguments) -> Result<()> {
     Ok(())
 }
 
-/// Names of the joints of a character's body in a capture that [`synth()`] wrote; none for other captures.
+/// Names of the joints of a character's body in a capture that [`synth()`] wrote; none for other
+/// captures.
 pub fn joint_names(capture: &Path) -> Result<Vec<String>> {
     #[derive(Default, serde::Deserialize)]
     #[serde(default)]

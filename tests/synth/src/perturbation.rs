@@ -39,8 +39,8 @@ pub struct Perturbation {
     /// Pixels by which the training masks are larger (smaller if negative) than they should be, −64
     /// to 64. What is added shows black.
     pub mask_pixels: i32,
-    /// Standard deviation of the noise of key points, pixels of a body 250 high, 0 to 50; none are made
-    /// at 0. They are SMPL's limbs' joints, each off by a constant as large beside it.
+    /// Standard deviation of the noise of key points, pixels of a body 250 high, 0 to 50; none are
+    /// made at 0. They are SMPL's limbs' joints, each off by a constant as large beside it.
     pub keypoint_pixels: f32,
     /// Training frames as a camera and a segmenter make them.
     pub photographed: bool,
@@ -213,8 +213,8 @@ fn numbered(frame: usize, seed: u64) -> u64 {
 /// Joints of SMPL's limbs.
 const LIMB_JOINTS: [usize; 12] = [1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21];
 
-/// Places of the joints in a frame's picture, and the height of the body there, pixels; none of a body
-/// without SMPL's joints.
+/// Places of the joints in a frame's picture, and the height of the body there, pixels; none of a
+/// body without SMPL's joints.
 fn projected(frame: &Frame, body: &BodyModel) -> Option<(Vec<Vec2>, f32)> {
     let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
     let all = |points: &[Vec3]| -> Option<Vec<Vec2>> {
@@ -381,8 +381,8 @@ mod tests {
         }
     }
 
-    /// As two real captures have them: intersection over union of prior and mask .67, 11 % of the masks
-    /// are not the person, joints 2.3 % of the height from key points.
+    /// As two real captures have them: intersection over union of prior and mask .67, 11 % of the
+    /// masks are not the person, joints 2.3 % of the height from key points.
     #[test]
     fn a_real_capture_has_the_statistics_of_real_captures() {
         let body = BodyModel::embedded();

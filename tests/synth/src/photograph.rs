@@ -11,16 +11,16 @@ const BLUR: f32 = 0.6;
 /// Interval of the frames blurred by motion, and length of the blur relative to the body's height.
 const MOVING: u64 = 8;
 const MOTION: f32 = 0.03;
-/// Area of the backdrop's pieces relative to the mask's, and their farthest distance from it relative to
-/// the body's height.
+/// Area of the backdrop's pieces relative to the mask's, and their farthest distance from it
+/// relative to the body's height.
 const PATCHES: f32 = 0.055;
 const NEAR: f32 = 0.05;
-/// Interval of the masks without a foot, and radius of the hole around its joint relative to the body's
-/// height.
+/// Interval of the masks without a foot, and radius of the hole around its joint relative to the
+/// body's height.
 const LAME: u64 = 3;
 const FOOT: f32 = 0.06;
-/// Length and radius of the thing in the right hand, relative to the body's height, and interval of the
-/// masks with it.
+/// Length and radius of the thing in the right hand, relative to the body's height, and interval of
+/// the masks with it.
 const HELD: [f32; 2] = [0.3, 0.012];
 const HELD_IN_MASKS: u64 = 2;
 /// Root mean square change of exposure.

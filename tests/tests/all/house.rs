@@ -33,8 +33,8 @@ struct Crate {
     mentions: Vec<(Names, Names, bool)>,
 }
 
-/// Lines of a file without comments and without what only tests compile, which stands last unless it
-/// is one item.
+/// Lines of a file without comments and without what only tests compile, which stands last unless
+/// it is one item.
 fn source(path: &Path) -> String {
     let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let (mut lines, mut out) = (text.lines(), String::new());
@@ -68,8 +68,8 @@ fn tokens(text: &str) -> Vec<&str> {
     out
 }
 
-/// Calls `found` with each path of the `use` tree at `at` and the name that it gets; returns where the
-/// tree ends.
+/// Calls `found` with each path of the `use` tree at `at` and the name that it gets; returns where
+/// the tree ends.
 fn leaves(tokens: &[&str], mut at: usize, mut path: Names, found: &mut impl FnMut(Names, &str)) -> usize {
     if tokens[at] == "{" {
         while tokens[at] != "}" {
@@ -130,8 +130,8 @@ impl Crate {
         }
     }
 
-    /// The module that defines what `path` names, seen from module `from`; `None` for modules themselves and
-    /// for names that lead back to themselves.
+    /// The module that defines what `path` names, seen from module `from`; `None` for modules
+    /// themselves and for names that lead back to themselves.
     fn resolve(&self, from: &Names, path: &[String], depth: usize) -> Option<Names> {
         let mut here = from.clone();
         for (i, segment) in path.iter().enumerate() {
@@ -155,8 +155,8 @@ impl Crate {
     }
 }
 
-/// Reads the crate whose sources are in `src`. What only tests compile is left out, and so are names
-/// that a module hands on from those below it.
+/// Reads the crate whose sources are in `src`. What only tests compile is left out, and so are
+/// names that a module hands on from those below it.
 fn imports(src: &Path) -> Imports {
     let mut house = Crate::default();
     let root = if src.join("lib.rs").exists() { "lib.rs" } else { "main.rs" };

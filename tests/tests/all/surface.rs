@@ -1,5 +1,5 @@
-//! Rasterising, ray casts and cameras are written apart from each other; here they must say the same of a
-//! body.
+//! Rasterising, ray casts and cameras are written apart from each other; here they must say the
+//! same of a body.
 
 use crate::common;
 

@@ -196,8 +196,8 @@ fn degenerate_meshes_are_hit_as_by_brute_force_or_are_errors() {
     assert_eq!(refused.to_string(), "face 0 has vertex index 1, but there are only 1 vertices");
 }
 
-/// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second at
-/// most, where pairs of equals were joined one a pass.
+/// Faces that are equal, collapsed to a point, or so by the scale of one vertex far away: a second
+/// at most, where pairs of equals were joined one a pass.
 #[test]
 fn a_tree_of_equal_faces_is_built_in_no_time() {
     let body = mesh::open_grid(100);

@@ -39,8 +39,8 @@ impl Lock {
         Ok(lock)
     }
 
-    /// Takes the folder for reading. A reader may add what follows from what it reads. Without a lock
-    /// in a folder that cannot be written and has none.
+    /// Takes the folder for reading. A reader may add what follows from what it reads. Without a
+    /// lock in a folder that cannot be written and has none.
     ///
     /// # Errors
     /// [`Ending::Busy`] where another process writes it; [`Ending::Unwritten`].

@@ -27,8 +27,8 @@ pub fn free_bytes() -> Option<u64> {
 /// Address space of the program itself: code, stacks and what the allocator reserves, bytes.
 const PROGRAM: u64 = 192 << 20;
 
-/// Checks that the process's address space has room for that much memory in all. An allocation beyond its limit
-/// aborts.
+/// Checks that the process's address space has room for that much memory in all. An allocation
+/// beyond its limit aborts.
 ///
 /// # Errors
 /// If the limit is lower.

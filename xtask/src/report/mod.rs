@@ -102,8 +102,8 @@ impl Run {
         page.is_file().then(|| carries(&page, &self.learnt)).transpose()
     }
 
-    /// What a report is made of: identities of what was learnt and of what was scored, and whether the
-    /// viewer's page is of the former.
+    /// What a report is made of: identities of what was learnt and of what was scored, and whether
+    /// the viewer's page is of the former.
     fn source(&self) -> Result<String> {
         Ok(format!("{} {} {:?}", self.learnt, self.metrics.of, self.shown()?))
     }

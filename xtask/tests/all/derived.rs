@@ -1,10 +1,12 @@
-//! What is made of a run is of that run: nothing stale passes for fresh.
+//! What is made of a run is of that run: nothing stale passes for fresh, and commands side by side
+//! come to the results that they come to one after the other.
 
 use crate::common;
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use common::{QUICK, bytes, done, folder, json, limited, refused, rewritten, stderr, text, xtask};
@@ -124,7 +126,8 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     std::os::unix::fs::symlink("/dev/zero", &motion).unwrap();
     refusal(&["export", text(&run), "--out", text(&glb), "--motion", text(&motion)], "zero.npz: more than");
     refusal(&["train", text(&capture), "--body", text(&motion)], "zero.npz: not a plain file");
-    // A pipe without a writer is waited for where it is read once, and refused where it is read again.
+    // A pipe without a writer is waited for where it is read once, and refused where it is read
+    // again.
     let pipe = folder.join("pipe.npz");
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
     refusal(&["train", text(&capture), "--body", text(&pipe)], "pipe.npz: not a plain file");
@@ -250,4 +253,74 @@ fn a_signal_before_the_first_step_says_that_nothing_was_made() {
     let output = child.wait_with_output().unwrap();
     let said = stderr(&output);
     assert!(output.status.code() == Some(143) && said.contains("had not been made"), "{said}");
+}
+
+/// Twenty seconds; `STORM=120 cargo test -p xtask storm` for two minutes.
+#[test]
+fn after_a_storm_of_commands_on_one_run_everything_is_as_one_alone_would_make_it() {
+    let length = std::env::var("STORM").ok().map_or(20, |seconds| seconds.parse().expect("STORM is a number"));
+    let folder = folder("storm");
+    let (_, run) = trained(&folder, "1");
+    let (glb, renders) = (folder.join("person.glb"), folder.join("drawn"));
+    let (steps, ends) = (AtomicUsize::new(8), AtomicUsize::new(0));
+    let storm = |n: usize| {
+        let begun = Instant::now();
+        let mut turn = n;
+        while begun.elapsed() < Duration::from_secs(length) {
+            let more = (steps.fetch_add(1, Ordering::SeqCst) + 1).to_string();
+            let train = ["train", "--resume", "--out", text(&run), "--checkpoint-every", "0", "--steps", &more];
+            let each: [&[&str]; 6] = [
+                &train,
+                &["export", text(&run), "--out", text(&glb)],
+                &["view", text(&run)],
+                &["render", text(&run), "tpose", "--baked", "--size", "8x8", "--out", text(&renders)],
+                &["eval", text(&run)],
+                &["eval", text(&run), "--baked"],
+            ];
+            let arguments = each[turn % each.len()];
+            turn += 1;
+            // A training needs the run alone.
+            let patience = if turn % each.len() == 1 { 100 } else { 1 };
+            let mut tries = (0..patience).map(|_| xtask(arguments));
+            let is_busy = |output: &Output| output.status.code() == Some(4);
+            let Some(output) = tries.find(|output| !is_busy(output)) else { continue };
+            std::thread::sleep(Duration::from_millis(100));
+            // The steps may be fewer than another training has taken.
+            let expected = [Some(0), Some(1)];
+            let said = stderr(&output);
+            assert!(expected.contains(&output.status.code()), "{arguments:?}: {:?} {said}", output.status);
+            assert!(output.status.code() != Some(1) || said.contains("steps"), "{arguments:?}: {said}");
+            ends.fetch_add(usize::from(output.status.success()), Ordering::SeqCst);
+        }
+    };
+    std::thread::scope(|scope| (0..3).for_each(|n| drop(scope.spawn(move || storm(2 * n)))));
+    println!("{} commands came to their ends in {length} s", ends.load(Ordering::SeqCst));
+    for arguments in [&["export", text(&run), "--out", text(&glb)][..], &["eval", text(&run)], &["view", text(&run)]] {
+        done(arguments);
+    }
+    let alone = folder.join("alone");
+    std::fs::create_dir(&alone).unwrap();
+    for name in ["config.toml", "checkpoint.safetensors", "body.safetensors", "person.safetensors", "train.jsonl"] {
+        std::fs::copy(run.join(name), alone.join(name)).unwrap();
+    }
+    let fresh = folder.join("fresh.glb");
+    for arguments in
+        [&["export", text(&alone), "--out", text(&fresh)][..], &["eval", text(&alone)], &["view", text(&alone)]]
+    {
+        done(arguments);
+    }
+    assert!(bytes(&glb) == bytes(&fresh));
+    let [ours, theirs] = [&run, &alone].map(|run| json(&run.join("metrics.json")));
+    // Seconds are of the machine: a report of the same scores is the same.
+    std::fs::copy(run.join("metrics.json"), alone.join("metrics.json")).unwrap();
+    std::fs::write(alone.join("report.html"), "stale").unwrap();
+    done(&["view", text(&alone)]);
+    for name in ["avatar.safetensors", "person.html", "report.html"] {
+        assert!(bytes(&run.join(name)) == bytes(&alone.join(name)), "{name}");
+    }
+    let scores = |metrics: &Value| ["novel_view", "train_view"].map(|split| metrics["splits"][split]["frames"].clone());
+    assert!(ours["of"] == theirs["of"] && scores(&ours) == scores(&theirs), "{ours}\n{theirs}");
+    assert!(ours["steps"].as_u64().unwrap() > 8, "no training got through: {ours}");
+    let left: Vec<_> = std::fs::read_dir(&run).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert!(left.iter().all(|name| !name.to_string_lossy().contains("unfinished")), "{left:?}");
 }

@@ -66,7 +66,8 @@ fn what_cannot_be_imported_is_said_in_one_line_and_leaves_nothing() {
     import(&["--fit", text(&wham), "--masks", text(&masks), "--body", text(&body)], &["SMPL_NEUTRAL.pkl", "55 joints"]);
 }
 
-/// GVHMR's file saved by numpy, as it would be if its body were SMPL-X, whose pelvis is lower at rest.
+/// GVHMR's file saved by numpy, as it would be if its body were SMPL-X, whose pelvis is lower at
+/// rest.
 fn of_smplx(fit: &Path, to: &Path) {
     let mut file = TorchFile::open("fit", std::fs::File::open(fit).unwrap()).unwrap();
     let root = file.root().clone();

@@ -53,7 +53,8 @@ fn a_surface_is_trained_scored_drawn_exported_and_shown() {
     refused(&["export", text(&run), "--out", text(&run.join("again.glb"))], &["avatar.safetensors"]);
 }
 
-/// Every tenth frame of a capture without other cameras is scored; nothing is learnt from its pixels.
+/// Every tenth frame of a capture without other cameras is scored; nothing is learnt from its
+/// pixels.
 #[test]
 fn frames_are_held_out_where_there_is_no_other_camera() {
     let folder = folder("held-out");

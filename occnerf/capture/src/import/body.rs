@@ -14,8 +14,9 @@ use crate::item::Item;
 /// Joints of a hand, and numbers of its pose.
 const HAND: usize = 15;
 
-/// Reads the body of a fit by `tool`: `given`, or the first that fits of the `.npz` and `.pkl` files
-/// in folders `body` beside `near` or above; without a path the embedded body, where there is none.
+/// Reads the body of a fit by `tool`: `given`, or the first that fits of the `.npz` and `.pkl`
+/// files in folders `body` beside `near` or above; without a path the embedded body, where there is
+/// none.
 pub(super) fn find(
     tool: Tool,
     given: Option<&Path>,

@@ -62,8 +62,8 @@ pub(super) fn peoplesnapshot(tool: Tool, fit: &Item<'_>, video: &Video) -> Resul
 }
 
 /// A scene of NeuMan: `smpl_output_*.pkl`, a person {`pose` (N,72), `betas` (N,10)} without a
-/// place; beside it `alignments.npy`, by picture a matrix (4,3) that takes a row (x, y, z, 1) of the
-/// body to the scene, in which lengths have another unit, and COLMAP's `sparse/cameras.txt` and
+/// place; beside it `alignments.npy`, by picture a matrix (4,3) that takes a row (x, y, z, 1) of
+/// the body to the scene, in which lengths have another unit, and COLMAP's `sparse/cameras.txt` and
 /// `sparse/images.txt`. Picture `00012.png` is row 12. What lenses do beyond a pinhole is passed
 /// over, as NeuMan's own reader does.
 pub(super) fn neuman(path: &Path, people: &[(String, Item<'_>)], video: &Video) -> Result<Fit, CaptureError> {

@@ -79,7 +79,8 @@ impl Tool {
         if self.hands_at_mean().is_some() { SMPLX } else { SMPL }
     }
 
-    /// Pelvis at rest of its body model in the mean shape, which translations are relative to; `None` for points.
+    /// Pelvis at rest of its body model in the mean shape, which translations are relative to;
+    /// `None` for points.
     pub(super) fn pelvis(self) -> Option<DVec3> {
         let pelvis = if self.joints() == SMPLX { [0.003, -0.351, 0.012] } else { [-0.002, -0.241, 0.029] };
         (!self.is_points()).then_some(DVec3::from_array(pelvis))
@@ -127,7 +128,8 @@ pub(super) struct Person {
     pub ghosts: usize,
     /// Frames whose picture is absent.
     pub absent: usize,
-    /// Vertices of SAM 3D Body's mesh, a subset of them after each frame's points; 0 without a mesh.
+    /// Vertices of SAM 3D Body's mesh, a subset of them after each frame's points; 0 without a
+    /// mesh.
     pub vertices: usize,
 }
 

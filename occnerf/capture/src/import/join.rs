@@ -25,8 +25,8 @@ pub(super) enum Disjoint {
 
 /// The frames of named entries, sorted in the natural order of their names.
 ///
-/// Names alone do not decide: of a video whose pictures are counted from 1, masks that a tool counts from
-/// 0 have the names of their neighbours.
+/// Names alone do not decide: of a video whose pictures are counted from 1, masks that a tool
+/// counts from 0 have the names of their neighbours.
 pub(super) fn by_name(video: &Video, names: &[&str]) -> Result<Joined, Disjoint> {
     let at: Vec<Option<usize>> = names.iter().map(|name| video.index(name)).collect();
     let matched = |at: &[Option<usize>]| at.iter().flatten().count();
@@ -102,9 +102,9 @@ fn place(frames: &[usize], number: usize, offset: i64) -> Option<usize> {
     frames.binary_search(&wanted).ok()
 }
 
-/// The difference of a frame's number and an entry's under which most have a partner. Of equals: the
-/// one under which both begin and end together, then the same numbers where names look alike, then a
-/// count from 0 beside frames counted from 1.
+/// The difference of a frame's number and an entry's under which most have a partner. Of equals:
+/// the one under which both begin and end together, then the same numbers where names look alike,
+/// then a count from 0 beside frames counted from 1.
 fn offset(frames: &[usize], numbers: &[usize], same_width: bool) -> Option<i64> {
     let signed = |n: &usize| i64::try_from(*n).ok();
     let (first, last) = (signed(frames.first()?)?, signed(frames.last()?)?);

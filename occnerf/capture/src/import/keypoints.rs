@@ -26,8 +26,8 @@ const HANDS: usize = 22;
 /// A person in a picture: x, y, confidence of each point.
 type Detection = Vec<[f32; 3]>;
 
-/// Gives each frame the key points of the person whose joints project nearest to them; returns what to say
-/// of them.
+/// Gives each frame the key points of the person whose joints project nearest to them; returns what
+/// to say of them.
 pub(super) fn add(
     path: &Path,
     frames: &mut [Placed],

@@ -192,8 +192,8 @@ impl ValueStatistics {
         }
     }
 
-    /// Coverage for alpha, for values of at least half of the full scale outside palettes, or for 255
-    /// alone, of the background if it has most of the border; object ids otherwise.
+    /// Coverage for alpha, for values of at least half of the full scale outside palettes, or for
+    /// 255 alone, of the background if it has most of the border; object ids otherwise.
     fn meaning(&self, dir: &Path, options: &ImportOptions) -> Result<(Meaning, &'static str), CaptureError> {
         let found: Vec<u32> = self.values.iter().copied().filter(|value| *value > 0).collect();
         let shades = self.shaded > 0 && found.iter().any(|&value| value > self.full / 2);

@@ -3,8 +3,8 @@
 //! [`import`] reads the frames of a video, a fit and masks, and writes a capture in HumanNeRF's
 //! wild layout for [`super::load_capture`]. Formats are detected by content:
 //!
-//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, CLIFF, GLAMR, ROMP, EasyMocap, and
-//!   the data sets PeopleSnapshot (also as GaussianAvatar has it) and NeuMan ([`Tool`]);
+//! - fits: WHAM, 4D-Humans / PHALP, GVHMR, PromptHMR, VIBE / PyMAF, CLIFF, GLAMR, ROMP, EasyMocap,
+//!   and the data sets PeopleSnapshot (also as GaussianAvatar has it) and NeuMan ([`Tool`]);
 //! - points, to which a body is fitted: SAM 3D Body, and arrays of joints of any estimator;
 //! - masks: object ids (SAM 2's palette PNGs or folders, Grounded-SAM-2's `.npy`), coverage
 //!   (MatAnyone, plain 0/255 pictures), or the fit's own (4D-Humans / PHALP, PromptHMR);
@@ -79,14 +79,15 @@ pub struct Imported {
     pub absent: usize,
     /// What a user should know: gaps of the pictures, and what was joined other than by name.
     pub notes: Vec<String>,
-    /// Largest standard deviation of a shape coefficient over the frames; the capture has the robust
-    /// mean.
+    /// Largest standard deviation of a shape coefficient over the frames; the capture has the
+    /// robust mean.
     pub betas_spread: f64,
     /// Focal length in pixels of the first frame.
     pub focal: f64,
     /// Kind of the masks.
     pub masks: &'static str,
-    /// The body model's file; `None` for the embedded body, in its mean shape unless fitted to points.
+    /// The body model's file; `None` for the embedded body, in its mean shape unless fitted to
+    /// points.
     pub body: Option<PathBuf>,
 }
 
@@ -94,8 +95,8 @@ pub struct Imported {
 ///
 /// # Errors
 /// Files that are missing, malformed, of unknown format, or inconsistent: frames beyond the video,
-/// pictures or masks of unequal sizes, a named body model with other joints than the fit's. The error names
-/// file, key, expected and actual value. Files already written are left.
+/// pictures or masks of unequal sizes, a named body model with other joints than the fit's. The
+/// error names file, key, expected and actual value. Files already written are left.
 pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureError> {
     let video = Video::list(&options.frames)?;
     if let Some(focal) = options.focal.filter(|focal| !(*focal >= 1.0 && *focal <= 1e6)) {
@@ -178,11 +179,12 @@ pub fn import(options: &ImportOptions, out: &Path) -> Result<Imported, CaptureEr
     })
 }
 
-/// The person chosen, ids and numbers of frames of the others, and a hint at one person's other ids.
+/// The person chosen, ids and numbers of frames of the others, and a hint at one person's other
+/// ids.
 type Choice = (Person, Vec<(String, usize)>, Option<String>);
 
-/// The person `asked` for, of one id or of several (`0,4,17`), or the one in most frames (the first of
-/// equals).
+/// The person `asked` for, of one id or of several (`0,4,17`), or the one in most frames (the first
+/// of equals).
 fn choose(path: &Path, mut people: Vec<Person>, asked: Option<&str>) -> Result<Choice, CaptureError> {
     let most = (0..people.len()).min_by_key(|&i| (usize::MAX - people[i].frames.len(), i));
     let ids: Vec<String> = match (asked, most) {
@@ -218,7 +220,8 @@ fn choose(path: &Path, mut people: Vec<Person>, asked: Option<&str>) -> Result<C
     Ok((person, others, (!continued.is_empty()).then_some(hint)))
 }
 
-/// Whether two tracks may be of one person: no frame in common, and ends within a second and a metre.
+/// Whether two tracks may be of one person: no frame in common, and ends within a second and a
+/// metre.
 fn continues(a: &Person, b: &Person) -> bool {
     const FRAMES: usize = 30;
     const METRES: f64 = 1.0;
@@ -262,8 +265,8 @@ fn robust_mean<'a>(frames: impl Iterator<Item = &'a [f64]> + Clone) -> (Vec<f64>
     ((0..BETAS).map(mean).collect(), spread)
 }
 
-/// Converts a fitted frame to the capture's form: all joints of the body model, and a translation that
-/// keeps the pelvis of the frame's own shape, at rest at `rest` if the fit is of another body.
+/// Converts a fitted frame to the capture's form: all joints of the body model, and a translation
+/// that keeps the pelvis of the frame's own shape, at rest at `rest` if the fit is of another body.
 fn placed(
     mut frame: FitFrame,
     rest: Option<DVec3>,

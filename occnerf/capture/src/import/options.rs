@@ -9,8 +9,8 @@ pub struct ImportOptions {
     pub frames: PathBuf,
     /// The estimator's file, or EasyMocap's folder.
     pub fit: PathBuf,
-    /// The segmenter's folder, or one `.npy` or `.npz` file; `None`: the masks in the fit, or the alpha
-    /// channels of the frames.
+    /// The segmenter's folder, or one `.npy` or `.npz` file; `None`: the masks in the fit, or the
+    /// alpha channels of the frames.
     pub masks: Option<PathBuf>,
     /// The estimator's id of the person; `None`: the one in most frames.
     pub person: Option<String>,
@@ -25,8 +25,9 @@ pub struct ImportOptions {
     pub body: Option<PathBuf>,
     /// Joint set of a fit that is an array of joints, one of [`point_fit::joint_sets`].
     pub joints: Option<String>,
-    /// Points of the body that SAM 3D Body's `pred_vertices` lie on: `triangle_ids` (V) and `baryc_coords`
-    /// (V,3) in its faces, as `smpl2mhr_mapping.npz` of MHR has them; those of the open body are known.
+    /// Points of the body that SAM 3D Body's `pred_vertices` lie on: `triangle_ids` (V) and
+    /// `baryc_coords` (V,3) in its faces, as `smpl2mhr_mapping.npz` of MHR has them; those of the
+    /// open body are known.
     pub vertex_map: Option<PathBuf>,
     /// 2-D key points of a detector: OpenPose's folder, or an array (T, J, 3) of one person.
     pub keypoints: Option<PathBuf>,

@@ -13,8 +13,8 @@ use super::video::Video;
 use crate::CaptureError;
 use crate::item::Item;
 
-/// Reads joints (T,J,3) in camera axes, metres, of a `.npy` file or the only such array of an `.npz`;
-/// joints that are NaN are missing. The focal length is not in it: √(W² + H²).
+/// Reads joints (T,J,3) in camera axes, metres, of a `.npy` file or the only such array of an
+/// `.npz`; joints that are NaN are missing. The focal length is not in it: √(W² + H²).
 pub(super) fn read(path: &Path, set: &str, count: usize, video: &Video) -> Result<Fit, CaptureError> {
     let expected = format!("shape [frames, {count}, 3], as {set} has");
     let array = array(path, &expected, |shape| shape.len() == 3 && shape[1..] == [count, 3])?;
@@ -43,8 +43,8 @@ pub(super) fn count(set: &str) -> Result<usize, CaptureError> {
 
 /// Vertices of MHR, SAM 3D Body's mesh.
 pub(super) const MHR: usize = 18439;
-/// Faces of the open body on which those of MHR's vertices that are read lie: the median over four people of the
-/// points nearest to `pred_vertices`, on the body fitted to their key points.
+/// Faces of the open body on which those of MHR's vertices that are read lie: the median over four
+/// people of the points nearest to `pred_vertices`, on the body fitted to their key points.
 #[rustfmt::skip]
 const FACES: [u16; 128] = [
     6094, 2637, 2742, 6871, 2489, 118, 24, 4835, 6042, 2526, 17, 313, 6102, 2509, 3870, 6871, 2544, 5956, 31,
@@ -57,9 +57,9 @@ const FACES: [u16; 128] = [
     9732, 9912, 9781, 13294, 10191, 13684, 9947,
 ];
 
-/// The body's points that the vertices of a person after its key points lie on, of `vertices` in all: by the mapping
-/// file `map`, `triangle_ids` (V) and `baryc_coords` (V,3); without one the open body's, if `model` is `open` and the
-/// mesh MHR.
+/// The body's points that the vertices of a person after its key points lie on, of `vertices` in
+/// all: by the mapping file `map`, `triangle_ids` (V) and `baryc_coords` (V,3); without one the
+/// open body's, if `model` is `open` and the mesh MHR.
 pub(super) fn mapped(
     fit: &Path,
     map: Option<&Path>,
@@ -96,8 +96,8 @@ pub(super) fn mapped(
     ids.iter().zip(&rows).step_by(stride(vertices)).map(point).collect()
 }
 
-/// Fits `model` to a person's points, and to the vertices after them that lie on `mapped`: poses, places and one shape.
-/// Returns what to say of it.
+/// Fits `model` to a person's points, and to the vertices after them that lie on `mapped`: poses,
+/// places and one shape. Returns what to say of it.
 pub(super) fn solve(
     path: &Path,
     set: &str,

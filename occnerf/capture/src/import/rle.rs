@@ -61,8 +61,9 @@ impl Rle {
     }
 }
 
-/// Decodes COCO's compression: six bits a character from `0` on, five of the number, the lowest first,
-/// and a continuation bit. From the third on, a number is the difference to the one two earlier.
+/// Decodes COCO's compression: six bits a character from `0` on, five of the number, the lowest
+/// first, and a continuation bit. From the third on, a number is the difference to the one two
+/// earlier.
 fn decompressed(bytes: &[u8], most: usize) -> Result<Vec<u32>, String> {
     let mut runs: Vec<u32> = Vec::new();
     let mut rest = bytes.iter();

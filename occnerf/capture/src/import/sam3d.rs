@@ -1,8 +1,7 @@
-//! SAM 3D Body's list of dictionaries, one a person: `pred_keypoints_3d` (70,3) in camera axes from a
-//! place at `pred_cam_t` (3), `focal_length`, `pred_keypoints_2d` (70,2), `mask`, `pred_vertices` (V,3) in
-//! the axes of the points. Saved by `.npz`,
-//! `.npy`, pickle or JSON: a folder with a file a frame, or one file with a list of frames, or a
-//! dictionary of them by name.
+//! SAM 3D Body's list of dictionaries, one a person: `pred_keypoints_3d` (70,3) in camera axes from
+//! a place at `pred_cam_t` (3), `focal_length`, `pred_keypoints_2d` (70,2), `mask`, `pred_vertices`
+//! (V,3) in the axes of the points. Saved by `.npz`, `.npy`, pickle or JSON: a folder with a file a
+//! frame, or one file with a list of frames, or a dictionary of them by name.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -176,8 +175,8 @@ fn fit(frames: Vec<(Option<String>, Value, &Path)>, video: &Video) -> Result<Fit
     Ok(Fit { tool: Tool::Sam3dBody, people, names })
 }
 
-/// Assigns the people of a frame to those of earlier frames: nearest pairs first, by the distance from
-/// the extrapolated place, in which depth has a low weight, and by the size of bones.
+/// Assigns the people of a frame to those of earlier frames: nearest pairs first, by the distance
+/// from the extrapolated place, in which depth has a low weight, and by the size of bones.
 fn assign(tracks: &mut Vec<Track>, found: Vec<FitFrame>, index: usize) {
     const METRES: f64 = 1.5;
     const DEPTH: f64 = 0.4;

@@ -304,7 +304,8 @@ proptest! {
 fn coverage(expected: [u8; 8], [r, g, b]: [u8; 3]) {
     use image::{Luma, LumaA, Rgba};
     let pixel = |x: u32, y: u32| expected[(y * 4 + x) as usize];
-    // Cut out of a photograph, or white; the rest of the picture is as background removers leave it.
+    // Cut out of a photograph, or white; the rest of the picture is as background removers leave
+    // it.
     for bytes in [
         png_of(|x, y| Rgba([255, 255, 255, pixel(x, y)])),
         png_of(|x, y| Rgba([r, g, b, pixel(x, y)])),

@@ -162,8 +162,8 @@ fn own_masks(item: &Item<'_>, count: usize) -> Result<Vec<OwnMask>, CaptureError
 }
 
 /// GLAMR's `grecon/NAME_seed1.pkl`: `cam_pose` (T,4,4) world to camera, `person_data` by person id
-/// {`smpl_pose` (T,69), `smpl_orient_world` (T,3), `root_trans_world` (T,3), the pelvis, `smpl_beta`
-/// (T,10), `exist_frames` (T), `cam_K` (T,3,3), zero where the person is hidden}.
+/// {`smpl_pose` (T,69), `smpl_orient_world` (T,3), `root_trans_world` (T,3), the pelvis,
+/// `smpl_beta` (T,10), `exist_frames` (T), `cam_K` (T,3,3), zero where the person is hidden}.
 pub(super) fn glamr(root: &Item<'_>) -> Result<Fit, CaptureError> {
     let camera = root.get("cam_pose")?;
     let cameras = camera.numbers(&[None, Some(4), Some(4)])?;

@@ -26,8 +26,8 @@ const CLAMP_TO_EDGE: u32 = 33071;
 pub struct GlbOptions<'a> {
     /// The atlas as JPEG of this quality, 1 to 100, in place of PNG.
     pub jpeg: Option<u8>,
-    /// Shaded by the lights of the scene it stands in, in place of `KHR_materials_unlit`. The atlas is
-    /// the same: the light of the video is in neither.
+    /// Shaded by the lights of the scene it stands in, in place of `KHR_materials_unlit`. The atlas
+    /// is the same: the light of the video is in neither.
     pub lit: bool,
     /// Makes a VRM of it, see [`Avatar::to_glb_with`].
     pub vrm: Option<Vrm<'a>>,
@@ -37,17 +37,18 @@ impl Avatar {
     /// glTF 2.0 binary (`.glb`).
     ///
     /// One skinned mesh (`POSITION`, `NORMAL`, `TEXCOORD_0`, `JOINTS_0`, `WEIGHTS_0` in 16 bits),
-    /// `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest pose as bind pose, and an
-    /// animation a clip. The atlas is under even light; that of the video is the scene's extra `light`,
-    /// a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓), 0.2) times as
-    /// bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are left out.
+    /// `KHR_materials_unlit`, the atlas as PNG, a node a joint with the rest pose as bind pose, and
+    /// an animation a clip. The atlas is under even light; that of the video is the scene's extra
+    /// `light`, a vector s: a surface with unit normal n is max(1 + s · n + ½ |s| ((ŝ · n)² − ⅓),
+    /// 0.2) times as bright, see [`crate::capture::Light`]. Pose blend shapes and confidence are
+    /// left out.
     ///
-    /// A VRM 1.0 has the extension `VRMC_vrm` with `humanoid` and `meta`; its rest pose, and bind pose,
-    /// is the person with level arms, [`Avatar::with_level_arms`].
+    /// A VRM 1.0 has the extension `VRMC_vrm` with `humanoid` and `meta`; its rest pose, and bind
+    /// pose, is the person with level arms, [`Avatar::with_level_arms`].
     ///
     /// # Errors
-    /// [`Error::Bake`] with what [`Avatar::validate`] finds, for more than 4 GiB, and for a VRM of a
-    /// skeleton without the fifteen joints that it must have.
+    /// [`Error::Bake`] with what [`Avatar::validate`] finds, for more than 4 GiB, and for a VRM of
+    /// a skeleton without the fifteen joints that it must have.
     pub fn to_glb_with(&self, options: &GlbOptions<'_>) -> Result<Vec<u8>, Error> {
         let Some(vrm) = &options.vrm else { return self.gltf(options, None) };
         self.validate().map_err(Error::Bake)?;
@@ -346,8 +347,8 @@ fn human_bones(skeleton: &[Joint]) -> Vec<Option<String>> {
 }
 
 impl Avatar {
-    /// The avatar at rest with arms level along x, as a T-pose has them; motions stay what they are.
-    /// Pose blend shapes are left out.
+    /// The avatar at rest with arms level along x, as a T-pose has them; motions stay what they
+    /// are. Pose blend shapes are left out.
     ///
     /// # Errors
     /// [`Error::Bake`] for a skeleton whose arms are not known by name.

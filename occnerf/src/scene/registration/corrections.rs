@@ -7,9 +7,9 @@ use volrender::Camera;
 
 use crate::capture::Frame;
 
-/// Correction of a frame's pose: a translation of the body in camera axes, then a rotation vector of
-/// each bone about its joint in world axes. A bone's rotation translates its children and does not
-/// rotate them.
+/// Correction of a frame's pose: a translation of the body in camera axes, then a rotation vector
+/// of each bone about its joint in world axes. A bone's rotation translates its children and does
+/// not rotate them.
 pub(super) type Correction = Vec<Vec3>;
 
 /// The corrected pose and placement of a frame.
@@ -72,8 +72,8 @@ pub(super) struct PointJacobian {
 }
 
 impl PointJacobian {
-    /// Positions in `columns` of the unknowns that rotate the surface at the point, with its angular
-    /// velocity by them.
+    /// Positions in `columns` of the unknowns that rotate the surface at the point, with its
+    /// angular velocity by them.
     pub fn rotations(&self) -> impl Iterator<Item = (usize, Vec3)> {
         self.bones.iter().flat_map(|&(first, weight)| (0..3).map(move |i| (first + i, weight * Vec3::AXES[i])))
     }
@@ -165,8 +165,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(12))]
 
-        /// Pose blend shapes move with the turns a little, which the derivatives leave out. Normals turn
-        /// with the bone that their surface hangs on, and with no other.
+        /// Pose blend shapes move with the turns a little, which the derivatives leave out. Normals
+        /// turn with the bone that their surface hangs on, and with no other.
         #[test]
         fn vertices_and_normals_move_as_by_finite_differences(seed in any::<u64>(), about_origin in any::<bool>()) {
             let mut model = BodyModel::embedded();
@@ -193,8 +193,8 @@ mod tests {
                 model.weights.row(v as usize).find(|(_, weight)| *weight > 0.9999).map(|(joint, _)| joint)
             };
             let mut is_rigid = vec![true; model.num_vertices()];
-            // Rounding of f32 places at metres turns normals of 5 mm edges by 1e-4, a hundredth of the
-            // difference's step.
+            // Rounding of f32 places at metres turns normals of 5 mm edges by 1e-4, a hundredth of
+            // the difference's step.
             let short = |[a, b]: [u32; 2]| {
                 shape.vertices[a as usize].distance(shape.vertices[b as usize]) < 5e-3
             };

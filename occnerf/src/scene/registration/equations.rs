@@ -53,9 +53,9 @@ pub(super) struct Equations<'a> {
 }
 
 impl<'a> Equations<'a> {
-    /// Equations of a body in the pose `posed` of `shape`; `reshaped` has [`BETA_STEP`] added to each
-    /// shape coefficient, `camera` is the frame's. The global unknowns are the shape and, where
-    /// given, the perspective.
+    /// Equations of a body in the pose `posed` of `shape`; `reshaped` has [`BETA_STEP`] added to
+    /// each shape coefficient, `camera` is the frame's. The global unknowns are the shape and,
+    /// where given, the perspective.
     pub fn new(
         model: &'a BodyModel,
         (shape, posed): (&'a Shaped, &'a Posed),

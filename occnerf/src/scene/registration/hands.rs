@@ -11,15 +11,15 @@ const CURLS: [f32; 3] = [0.0, 0.5, 1.0];
 /// Curl of hands that no frames show, and the error of the fingers that a full curl has to gain.
 const RELAXED: f32 = 0.5;
 const WORTH: f32 = 0.1;
-/// A frame shows a hand with this share of the palm's vertices in the mask, and of the flat fingers'
-/// beside the rest of the body by more than this many pixels; least such frames.
+/// A frame shows a hand with this share of the palm's vertices in the mask, and of the flat
+/// fingers' beside the rest of the body by more than this many pixels; least such frames.
 const SHOWN: f32 = 0.75;
 const FREE: f32 = 0.7;
 const BESIDE: i32 = 2;
 const LEAST_FRAMES: usize = 5;
 
-/// Curl of the fingers of each hand, the same in all frames: flat fingers lie outside the masks of a
-/// fist, a fist leaves masks of flat fingers uncovered. A hand that too few frames show is as the
+/// Curl of the fingers of each hand, the same in all frames: flat fingers lie outside the masks of
+/// a fist, a fist leaves masks of flat fingers uncovered. A hand that too few frames show is as the
 /// other. `posed` gives the vertices of a body in the frame of each of `crops`.
 pub(super) fn curls(
     model: &BodyModel,
@@ -47,9 +47,9 @@ pub(super) fn curls(
     [0, 1].map(|side: usize| curls[side].or(curls[1 - side]).unwrap_or(RELAXED))
 }
 
-/// Error of each curl of a hand in a frame that shows it: the share of its fingers outside the mask,
-/// and of the flat ones inside the mask that it leaves uncovered. `posed` has the vertices of each
-/// curl's body.
+/// Error of each curl of a hand in a frame that shows it: the share of its fingers outside the
+/// mask, and of the flat ones inside the mask that it leaves uncovered. `posed` has the vertices of
+/// each curl's body.
 fn errors(crop: &Crop, posed: &[Vec<Vec3>; CURLS.len()], hand: &[(usize, f32)]) -> Option<[f32; CURLS.len()]> {
     let pixel = |vertices: &[Vec3], v: usize| crop.camera.project(vertices[v]).and_then(|at| crop.pixel(at.truncate()));
     let is_masked = |vertices: &[Vec3], v: usize| {

@@ -53,8 +53,8 @@ const BETAS: usize = 10;
 /// Search distance from the prior's outline to the mask's in the first and in the last round,
 /// pixels.
 const REACH: [f32; 2] = [12.0, 5.0];
-/// Least rounds of outlines before hands are told to be fists: fingers of a body that is not registered lie
-/// outside masks too.
+/// Least rounds of outlines before hands are told to be fists: fingers of a body that is not
+/// registered lie outside masks too.
 const FIST_ROUNDS: usize = 4;
 /// [`DetectorModel::width`] in the first round; 1 in the last.
 const WIDTH: f32 = 6.0;
@@ -367,8 +367,8 @@ fn rate(capture: &Capture, frames: &[usize]) -> f64 {
     if count > 0.0 { (sum / count).sqrt() / gap as f64 } else { 0.0 }
 }
 
-/// Vector along the optical axis from the camera plane to the root joint of a frame as given; `None`
-/// for a root behind the camera.
+/// Vector along the optical axis from the camera plane to the root joint of a frame as given;
+/// `None` for a root behind the camera.
 fn root_depth(frame: &Frame, model: &BodyModel) -> Option<Vec3> {
     let root = model.shaped(&frame.betas).joints.first().copied()?;
     let root = match frame.placement {

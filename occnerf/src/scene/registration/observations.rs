@@ -22,8 +22,8 @@ const STEP: f32 = 0.5;
 /// An outline point needs background this far outside and body this far inside, pixels.
 const OUTSIDE: f32 = 2.0;
 const INSIDE: f32 = 1.5;
-/// Coverage of the rendered outline at a point whose distance is measured: 0.5 on straight edges, less on
-/// thin limbs, more in concave corners.
+/// Coverage of the rendered outline at a point whose distance is measured: 0.5 on straight edges,
+/// less on thin limbs, more in concave corners.
 const LEVELS: RangeInclusive<f32> = 0.15..=0.85;
 /// Rows and columns of a pixel whose coverage is rendered, of four samples each.
 const FINE: usize = 2;
@@ -91,8 +91,8 @@ pub(crate) struct ObservationOptions {
 
 /// Searches the mask's edge along the normals of the outline of `vertices`, and samples the colours
 /// of vertices that face the camera. The edge is where the mask falls below the coverage that the
-/// rendered outline has at its own point: a pixel's footprint shifts both alike on thin limbs and in
-/// corners. It counts if background lies beyond it, which excludes edges at an occluder.
+/// rendered outline has at its own point: a pixel's footprint shifts both alike on thin limbs and
+/// in corners. It counts if background lies beyond it, which excludes edges at an occluder.
 pub(crate) fn observe(
     crop: &Crop,
     vertices: &[Vec3],
@@ -303,8 +303,8 @@ impl Crop {
         interpolated(|i| f32::from(self.coverage[i]) / 255.0, at, &self.camera)
     }
 
-    /// The crop under a Gaussian blur with standard deviation `sigma`, pixels; black and empty beyond
-    /// its border.
+    /// The crop under a Gaussian blur with standard deviation `sigma`, pixels; black and empty
+    /// beyond its border.
     pub fn blurred(&self, sigma: f32) -> Blurred {
         let (width, height) = (self.camera.width as usize, self.camera.height as usize);
         let radius = (2.5 * sigma).ceil() as usize;
@@ -332,8 +332,8 @@ impl Crop {
 }
 
 impl Blurred {
-    /// The subject's colour, interpolated bilinearly; `None` beyond the outermost pixel centres, and
-    /// where the coverage of one of the four pixels is below `least`.
+    /// The subject's colour, interpolated bilinearly; `None` beyond the outermost pixel centres,
+    /// and where the coverage of one of the four pixels is below `least`.
     pub fn sample(&self, at: Vec2, least: f32) -> Option<ColorSample> {
         let (corners, share) = corners(at, self.width, self.pixels.len() / self.width.max(1))?;
         let corners = corners.map(|i| self.pixels[i]);

@@ -133,16 +133,16 @@ impl PoseErrorModel {
     const LEAST: Self = Self { lateral: 0.002, depth: 0.002, rotation: 0.01, frames: 1.0 };
     const MOST: Self = Self { lateral: 0.2, depth: 0.2, rotation: 0.15, frames: ROTATION_FRAMES };
 
-    /// Initial model of a video whose poses turn by `rate` radians a frame and joint (root mean square):
-    /// errors change as fast as poses do.
+    /// Initial model of a video whose poses turn by `rate` radians a frame and joint (root mean
+    /// square): errors change as fast as poses do.
     pub fn of_motion(rate: f64) -> Self {
         // Infinite for a person who stands still.
         Self { frames: (TURN / rate).clamp(Self::LEAST.frames, Self::MOST.frames), ..Self::OUTLINES }
     }
 
-    /// Variances of the unknowns of a frame and their autoregressive coefficients at a frame spacing
-    /// of `gap` ([`Prior::ar_coefficients`]), (P) each. `unit` is the length of a metre of a body
-    /// 1.7 high.
+    /// Variances of the unknowns of a frame and their autoregressive coefficients at a frame
+    /// spacing of `gap` ([`Prior::ar_coefficients`]), (P) each. `unit` is the length of a metre of
+    /// a body 1.7 high.
     ///
     /// [`Prior::ar_coefficients`]: crate::scene::registration::system::Prior::ar_coefficients
     pub fn prior(&self, unit: f32, per_frame: usize, gap: usize) -> (Vec<f64>, Vec<[f64; 2]>) {
@@ -159,9 +159,9 @@ impl PoseErrorModel {
         (0..per_frame).map(each).unzip()
     }
 
-    /// One step of expectation maximisation (Dempster, Laird and Rubin 1977): mean squared correction
-    /// plus posterior variance. Rotations take a doubled step, since unobserved axes stay at the
-    /// prior.
+    /// One step of expectation maximisation (Dempster, Laird and Rubin 1977): mean squared
+    /// correction plus posterior variance. Rotations take a doubled step, since unobserved axes
+    /// stay at the prior.
     pub fn reestimated(&self, corrections: &[Correction], variances: &[DVector<f64>], unit: f32) -> Self {
         let mean = |from: usize, to: Option<usize>| -> f64 {
             let (mut sum, mut count) = (0.0, 0);
@@ -289,7 +289,8 @@ mod tests {
         assert_eq!((&normals[0].matrix, &normals[0].vector), (&previous[0].matrix, &previous[0].vector));
     }
 
-    /// Estimates from a simulated process with errors `truth`, two axes of each bone being observed.
+    /// Estimates from a simulated process with errors `truth`, two axes of each bone being
+    /// observed.
     fn estimated(truth: PoseErrorModel, seed: u64) -> PoseErrorModel {
         let (per_frame, frames, noise) = (12, 300, 0.01f64);
         let (variances, ar_coefficients) = truth.prior(2.0, per_frame, 1);

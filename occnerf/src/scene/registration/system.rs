@@ -172,8 +172,8 @@ pub(super) fn solve(
     Some(Solution { per_frame, global, variances })
 }
 
-/// Inverse of a positive definite matrix by recursive 2 × 2 blocks, whose matrix products are faster
-/// than triangular solves.
+/// Inverse of a positive definite matrix by recursive 2 × 2 blocks, whose matrix products are
+/// faster than triangular solves.
 pub(super) fn inverse(matrix: DMatrix<f64>) -> Option<DMatrix<f64>> {
     let (size, half) = (matrix.nrows(), matrix.nrows() / 2);
     if size <= DIRECT {

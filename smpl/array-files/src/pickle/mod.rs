@@ -29,7 +29,8 @@ pub use value::{PERSISTENT, Value};
 /// Memory limit of the LZMA decoders in KiB: twice the dictionary of `xz -9`.
 const LZMA_KIBIBYTES: u32 = 128 << 10;
 
-/// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects, texts or plain values.
+/// Reads a pickle, plain or compressed by joblib, or a `.npy` file of objects, texts or plain
+/// values.
 ///
 /// # Errors
 /// [`Error::Io`], also beyond 2 GiB; [`Error::Pickle`], [`Error::Npy`].

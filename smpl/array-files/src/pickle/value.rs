@@ -132,8 +132,8 @@ impl Value {
         }
     }
 
-    /// [`Value::as_array`], or a sparse matrix (CSC, CSR, COO) made dense. `Ok(None)` for other types; `file` and
-    /// `key` name it in errors.
+    /// [`Value::as_array`], or a sparse matrix (CSC, CSR, COO) made dense. `Ok(None)` for other
+    /// types; `file` and `key` name it in errors.
     ///
     /// # Errors
     /// [`Error::Invalid`] for a sparse matrix whose parts disagree, or of more than 2²⁵ values.

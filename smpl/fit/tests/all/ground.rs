@@ -17,8 +17,8 @@ fn skeleton() -> (Vec<Joint>, f32) {
     (smpl::skeleton(BoneNames::Smpl, &body.parents, &shaped.joints), sole)
 }
 
-/// The recorded walk with errors of joint rotations, smooth in time: three waves an axis with periods of
-/// 0.7 to 2 s, `degrees` root mean square.
+/// The recorded walk with errors of joint rotations, smooth in time: three waves an axis with
+/// periods of 0.7 to 2 s, `degrees` root mean square.
 fn walk(degrees: f32) -> Option<MotionClip> {
     let mut walk = MotionClip::load(&shared("mocap/walk.npz")?).unwrap();
     let mut random = Random(5);

@@ -98,8 +98,8 @@ proptest! {
             pose[[4, 5, 18, 19][joint]] = bend;
         }
         let seen = points(&joints(), &betas, &pose, place);
-        // In one frame the noise cannot be measured and is taken for 1 cm: the prior of rotations then turns the root by
-        // up to 4.4 degrees in 4000 cases, in three frames by .25.
+        // In one frame the noise cannot be measured and is taken for 1 cm: the prior of rotations
+        // then turns the root by up to 4.4 degrees in 4000 cases, in three frames by .25.
         for (frames, degrees) in [(1, 6.0), (3, 1.0)] {
             let seen = seen.repeat(frames);
             let fitted = fit(&BODY, &joints(), &seen).unwrap();
@@ -124,7 +124,8 @@ fn noise_and_missing_points_are_borne() {
         for (f, (pose, place)) in truth.iter().enumerate() {
             let mut frame = points(&joints(), &betas, pose, *place);
             frame.iter_mut().for_each(|p| *p += noisy(&mut random, deviation));
-            // A tenth is missing here and there, the left arm for twenty frames, everything for five.
+            // A tenth is missing here and there, the left arm for twenty frames, everything for
+            // five.
             for (i, p) in frame.iter_mut().enumerate() {
                 let arm = [18, 20, 22].contains(&i) && (40..60).contains(&f);
                 if arm || (80..85).contains(&f) || random.unit() < 0.1 {

@@ -150,7 +150,8 @@ fn legal_but_rare_documents_are_read() {
     let order = |mode: usize| json.replacen(r#""indices":7"#, &format!(r#""mode":{mode}"#), 1);
     assert_eq!(read(&order(5), &binary).unwrap().faces, [[0, 1, 2], [2, 1, 3]]);
     assert_eq!(read(&order(6), &binary).unwrap().faces, [[0, 1, 2], [0, 2, 3]]);
-    // Compressed by Draco without being said to be required, beside the plain accessors or instead of them.
+    // Compressed by Draco without being said to be required, beside the plain accessors or instead
+    // of them.
     let draco = r#""extensions":{"KHR_draco_mesh_compression":{"bufferView":0}},"attributes":"#;
     let both = json.replacen(r#""attributes":"#, draco, 1);
     assert_eq!(read(&both, &binary).unwrap(), plain);
@@ -172,8 +173,8 @@ fn legal_but_rare_documents_are_read() {
     assert!(read(&used, &binary).unwrap().ignored[0].contains("EXT_mesh_gpu_instancing"));
 }
 
-/// Views as npm's meshoptimizer 1.0.1 (`encodeGltfBuffer`; `encodeFilterExp` of 15 bits, `encodeFilterQuat`
-/// of 16) writes those of positions, rotations and indices.
+/// Views as npm's meshoptimizer 1.0.1 (`encodeGltfBuffer`; `encodeFilterExp` of 15 bits,
+/// `encodeFilterQuat` of 16) writes those of positions, rotations and indices.
 #[test]
 fn compressed_views_hold_what_was_compressed() {
     let (json, binary) = arm();
@@ -244,7 +245,8 @@ fn textures_are_placed_and_what_is_not_read_is_named() {
 "textures":[{"source":0},{"source":0},{"source":1}],
 "images":[{"uri":"data:image/png;base64,AAAA"},{"uri":"data:image/jpeg;base64,BBBB"}],"meshes""#;
     let json = json.replacen(r#""meshes""#, material, 1);
-    // Coordinates of the texture: the first two weights of vertices, (2,0), (1,0), (0,1), (0.5,0.5).
+    // Coordinates of the texture: the first two weights of vertices, (2,0), (1,0), (0,1),
+    // (0.5,0.5).
     let json = json.replacen(r#""WEIGHTS_0":1"#, r#""WEIGHTS_0":1,"TEXCOORD_0":8,"COLOR_0":1"#, 1);
     // Three more primitives: without coordinates, with the first image again, with another.
     let more = |material: usize, uvs: &str| {
@@ -278,7 +280,8 @@ fn textures_are_placed_and_what_is_not_read_is_named() {
     let images: Vec<&[u8]> = read.textures.iter().map(|texture| texture.bytes.as_slice()).collect();
     assert_eq!((images, read.uvs.len()), (vec![&[0; 3][..], &[4, 16, 65]], 16));
     assert_eq!(read.texture_of, [[Some(0); 4], [None; 4], [Some(0); 4], [Some(1); 4]].concat());
-    // Colours of vertices are the weights, (2,0,0), (1,0,0), (0,1,0), (½,½,0), and never more than 1.
+    // Colours of vertices are the weights, (2,0,0), (1,0,0), (0,1,0), (½,½,0), and never more than
+    // 1.
     let colours = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.5, 0.0], [0.5, 0.25, 0.0]].map(Vec3::from);
     let tints = [colours, [Vec3::new(1.0, 0.5, 1.0); 4], [Vec3::ONE; 4], [Vec3::ONE; 4]].concat();
     assert_eq!(read.tints, tints);

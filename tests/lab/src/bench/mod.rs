@@ -35,8 +35,8 @@ enum What {
     /// Seconds against accuracy of every named approximation, each preset and each method: a table
     /// and charts.
     Pareto(Box<ParetoArguments>),
-    /// What happens to the demo as it gets hard: less to see, worse poses, shorter videos, …; a table
-    /// of breaking points and charts.
+    /// What happens to the demo as it gets hard: less to see, worse poses, shorter videos, …; a
+    /// table of breaking points and charts.
     Stability(StabilityArguments),
     /// Cost against error of the geometric kernels.
     Kernels {
@@ -67,8 +67,8 @@ struct SweepArguments {
     /// Fewer points and fewer steps: about 10 minutes on 2 cores
     #[arg(long)]
     quick: bool,
-    /// Steps of each run [default: 400, quick: 80; stability: 200, quick: 100]; presets of pareto run
-    /// their own number at 400 and in proportion otherwise
+    /// Steps of each run [default: 400, quick: 80; stability: 200, quick: 100]; presets of pareto
+    /// run their own number at 400 and in proportion otherwise
     #[arg(long)]
     steps: Option<u64>,
     #[command(flatten)]

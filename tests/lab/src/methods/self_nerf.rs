@@ -1,5 +1,6 @@
-//! [v_i, d_i] of each nearest vertex is encoded, d_i the height of x̂ over the tangent plane of v_i,
-//! and the features are blended by inverse distances (the order of Peng et al. 2022, SelfNeRF).
+//! [v_i, d_i] of each nearest vertex is encoded, d_i the height of x̂ over the tangent plane of
+//! v_i, and the features are blended by inverse distances (the order of Peng et al. 2022,
+//! SelfNeRF).
 
 use anyhow::Result;
 use hashgrid::{HashGrid, HashGridConfig};

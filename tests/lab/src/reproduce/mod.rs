@@ -110,8 +110,8 @@ impl ReproduceArguments {
         Ok(rows)
     }
 
-    /// Trains and scores every row that is not finished, with all its seeds; `failed` gets the runs that
-    /// did not work out, and why.
+    /// Trains and scores every row that is not finished, with all its seeds; `failed` gets the runs
+    /// that did not work out, and why.
     fn run(
         &self,
         scene: &str,
@@ -158,8 +158,8 @@ impl ReproduceArguments {
         Ok(summary)
     }
 
-    /// Makes a table a section of the results, named by the options that set it apart from the scene's
-    /// main tables.
+    /// Makes a table a section of the results, named by the options that set it apart from the
+    /// scene's main tables.
     fn publish(&self, scene: &str, summary: &Summary, directory: &Path) -> Result<()> {
         let (table, name) = (self.table(), scene_name(Some(scene)));
         let paper = if self.preset == Preset::Paper { " --preset paper" } else { "" };

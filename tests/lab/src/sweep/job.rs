@@ -162,7 +162,8 @@ fn keep_run(job: &Job, Keep { directory, trained }: &Keep) -> Result<Outcome> {
 }
 
 /// The scores under `directory` of the baked person of the run under `trained`, which is trained
-/// first if need be. Baking time adds to the run's seconds; parameters are texel colours and vertices.
+/// first if need be. Baking time adds to the run's seconds; parameters are texel colours and
+/// vertices.
 fn baked_unless_finished(
     directory: &Path,
     trained: &Path,
@@ -183,7 +184,8 @@ fn baked_unless_finished(
     })
 }
 
-/// The prepared scene of a job with its views thinned, and its method; what `auto` chooses counts as training.
+/// The prepared scene of a job with its views thinned, and its method; what `auto` chooses counts
+/// as training.
 fn prepared(job: &Job, outcome: &mut Outcome) -> Result<(Scene, Method)> {
     let thin = |capture: &mut Capture| {
         let stride = capture.eval.len().div_ceil(job.views.max(1)).max(1);

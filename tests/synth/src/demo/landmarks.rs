@@ -76,7 +76,8 @@ impl Landmarks {
         }
     }
 
-    /// Where a point of a flat hand, figure metres, is in a fist: fingers roll up below the knuckles.
+    /// Where a point of a flat hand, figure metres, is in a fist: fingers roll up below the
+    /// knuckles.
     pub fn fist(&self, q: Vec3) -> Vec3 {
         const KNUCKLES: f32 = 0.09;
         const RADIUS: f32 = 0.025;

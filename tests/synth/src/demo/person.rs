@@ -16,7 +16,8 @@ pub(super) struct Person {
     pub faces: Vec<[u32; 3]>,
     /// The first of `faces` that is not the body's.
     pub sheets: usize,
-    /// Places on the naked body at rest, or on a sheet, one a vertex: what colours are looked up by.
+    /// Places on the naked body at rest, or on a sheet, one a vertex: what colours are looked up
+    /// by.
     pub rest: Vec<Vec3>,
     /// `rest` with the clothes on.
     clothed: Vec<Vec3>,

@@ -44,8 +44,8 @@ struct Figure<'a> {
     unit: f32,
 }
 
-/// Films `character`; with the video come the height that the cameras stand for, the body model and the
-/// names of its joints.
+/// Films `character`; with the video come the height that the cameras stand for, the body model and
+/// the names of its joints.
 pub(super) fn film(
     character: &Character,
     motion: Option<&MotionClip>,

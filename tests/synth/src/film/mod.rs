@@ -54,9 +54,9 @@ pub struct Synthetic {
 /// arguments alone, not on the number of threads.
 ///
 /// # Errors
-/// [`CaptureError::Setting`] for values outside their ranges, and for characters that no body can be
-/// made of, or that `motion` cannot drive; [`CaptureError::Io`] where pictures that memory has no
-/// room for cannot be put into the system's temporary folder.
+/// [`CaptureError::Setting`] for values outside their ranges, and for characters that no body can
+/// be made of, or that `motion` cannot drive; [`CaptureError::Io`] where pictures that memory has
+/// no room for cannot be put into the system's temporary folder.
 pub fn synthesise(
     character: Option<&Character>,
     motion: Option<&MotionClip>,

@@ -102,8 +102,8 @@ fn sample(clip: &MotionClip, seconds: f32, joints: usize) -> (Vec<Vec3>, Vec3) {
     }
 }
 
-/// Rest to world, (J), of a skeleton that rests y up and faces +z, at each of `frames` that show all of
-/// `clip`, which is of SMPL's joints.
+/// Rest to world, (J), of a skeleton that rests y up and faces +z, at each of `frames` that show
+/// all of `clip`, which is of SMPL's joints.
 ///
 /// # Errors
 /// What the skeleton lacks by name.

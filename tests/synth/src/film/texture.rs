@@ -25,8 +25,8 @@ fn decoded(texture: &Texture, left: &mut u64) -> Result<RgbaImage, CaptureError>
     Ok(decoded.into_rgba8())
 }
 
-/// The colour and alpha at `uv`, bilinear, repeated beyond the edges. Coordinates that are not finite give
-/// the corner's.
+/// The colour and alpha at `uv`, bilinear, repeated beyond the edges. Coordinates that are not
+/// finite give the corner's.
 pub(super) fn sample(texture: &RgbaImage, uv: Vec2) -> Vec4 {
     let size = Vec2::new(texture.width() as f32, texture.height() as f32);
     let uv = if uv.is_finite() { uv - uv.floor() } else { Vec2::ZERO };

@@ -38,7 +38,8 @@ struct Attack {
     seeds: Vec<Vec<u8>>,
     /// Part of all inputs, in thousandths.
     share: u64,
-    /// Most memory, in bytes, that any of these inputs (at most the seed's size or 1 MiB each) may take.
+    /// Most memory, in bytes, that any of these inputs (at most the seed's size or 1 MiB each) may
+    /// take.
     most: u64,
 }
 
