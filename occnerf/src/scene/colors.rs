@@ -28,6 +28,9 @@ const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
 /// Least foreshortening weight of an observation.
 const SLANT: f32 = 0.05;
+/// Least mean foreshortening of an observed point: at the rims of masks, grazing surface shows the
+/// background.
+const GRAZING: f32 = 0.2;
 /// Least sum of the reliabilities of an observed point where frames disagree, frames.
 const EVIDENCE: f32 = 4.0;
 /// Frames in flight, at some megabytes of observations each.
@@ -37,8 +40,8 @@ impl PriorColors {
     /// Least-squares albedo over the visible training pixels of each point of the subdivided prior,
     /// or of its clothes if registered, weighted by foreshortening and reliability, under the light
     /// of the scene if the configuration asks for one. Contaminated edge pixels of masks are left
-    /// out. Vertices that are not observed reliably are completed by inverse distance weighting,
-    /// other such points interpolated from their vertices.
+    /// out. Vertices that are not observed reliably, or at grazing angles alone, are completed by
+    /// inverse distance weighting, other such points interpolated from their vertices.
     ///
     /// # Errors
     /// Pictures that cannot be read.
@@ -82,7 +85,8 @@ impl PriorColors {
             }
         }
         let least = reliability.disagreement * EVIDENCE;
-        let seen: Vec<bool> = sums.iter().map(|sum| sum.1 > 0.0 && sum.2 >= least).collect();
+        let is_seen = |sum: &(Vec3, f32, f32)| sum.1 > GRAZING * sum.2 && sum.2 >= least;
+        let seen: Vec<bool> = sums.iter().map(is_seen).collect();
         let mut colors: Vec<Vec3> =
             sums.iter().map(|(sum, squares, _)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
         let (vertices, between) = colors.split_at_mut(prior.len());
@@ -304,7 +308,7 @@ mod tests {
         for _ in 0..150 {
             let v = random.below(found.colors.len());
             let anchor = &found.mesh.anchors[v];
-            let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
+            let (mut sum, mut weights, mut count) = (DVec3::ZERO, 0.0, 0);
             for (frame, (vertices, normals)) in &frames {
                 let (view, pixels) = (&frame.view, frame.pixels().unwrap());
                 let place = anchor.mix(vertices);
@@ -324,8 +328,9 @@ mod tests {
                 let slant = anchor.mix(normals).normalize_or_zero().dot(towards).max(SLANT);
                 let color = Vec3::from_slice(&pixels.image.pixels[3 * pixel..]) / coverage;
                 (sum, weights) = (sum + f64::from(slant) * color.as_dvec3(), weights + f64::from(slant));
+                count += 1;
             }
-            if weights > 0.0 {
+            if weights > f64::from(GRAZING) * f64::from(count) {
                 shown += 1;
                 let error = (sum / weights - found.colors[v].as_dvec3()).length();
                 wrong += usize::from(!found.seen[v] || error > 1e-3);
