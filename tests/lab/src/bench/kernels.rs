@@ -132,7 +132,6 @@ pub fn run(directory: &Path, quick: bool, publish: bool) -> Result<()> {
         text.push_str(&format!("{}\n", table::aligned(&lines, 1)));
     }
     say!("{text}");
-    say!("written: {}", directory.join("kernels.png").display());
     let panels = kernels.iter().map(|kernel| {
         let of = |pick: fn(&Sample) -> f64| kernel.samples.iter().map(pick);
         Panel {
