@@ -321,3 +321,37 @@ fn masks_of_noise_are_said_to_fit_nothing() {
     }
     assert_eq!(likely(&capture, &body, small_views(&capture).unwrap()).unwrap(), [Mistake::NoFit]);
 }
+
+#[test]
+fn limbs_elsewhere_and_background_in_masks_are_named() {
+    let (mut lines, mut sums) = (Vec::new(), [[0; 4]; 5]);
+    for (name, capture, body) in good() {
+        let window = Capture { train: capture.train.iter().step_by(4).take(12).cloned().collect(), ..capture.clone() };
+        let parts = faults::parts(body);
+        let faults = |capture: &Capture| -> Vec<Vec<Fault>> {
+            let small = small_views(capture).unwrap();
+            small.iter().map(|view| one(&capture.train[view.index], view, body, &parts).unwrap().faults).collect()
+        };
+        for kind in 0..5 {
+            let mut wrong = window.clone();
+            let expected = Limb::ALL.get(kind).map_or(Fault::Background, |limb| Fault::Limb(*limb));
+            wrong.train.iter_mut().for_each(|frame| corrupt(expected, frame, body));
+            let found = faults(&wrong);
+            let counts = [
+                found.iter().filter(|f| f.contains(&expected)).count(),
+                found.iter().flatten().filter(|f| matches!(f, Fault::Limb(_)) && **f != expected).count(),
+                found.iter().flatten().filter(|f| **f == Fault::Background && **f != expected).count(),
+                found.len(),
+            ];
+            lines.push(format!("{name} {expected:?}: {counts:?}"));
+            (0..4).for_each(|i| sums[kind][i] += counts[i]);
+        }
+    }
+    let [right, other, background, _] = [0, 1, 2, 3].map(|i| sums[..4].iter().map(|counts| counts[i]).sum::<usize>());
+    let found = right + other + background;
+    println!("limbs: {right} of {found} named, {other} taken for another, {background} for background");
+    assert!(found > 15 * good().len() && 4 * right >= 3 * found && 10 * other < found, "{lines:#?}");
+    let [right, limb, _, all] = sums[4];
+    println!("background: {right} of {all} named, {limb} taken for a limb");
+    assert!(100 * (right + limb) >= 95 * all && 3 * right >= 2 * all, "{lines:#?}");
+}

@@ -140,7 +140,7 @@ fn gradients_with_respect_to_the_weights_agree_with_finite_differences() {
             let dot: f64 = (0..3).map(|a| canonical[a] * f64::from(d_canonical[a])).sum();
             dot + f * f64::from(d_likelihood)
         };
-        // The oracle is in f64: what is left is the third-order term.
+        // The oracle is in f64: the third-order term remains.
         let tolerance = Tolerance { abs: 2e-5, rel: 1e-3 };
         check("map", &start, &analytic, 1e-3, tolerance, loss).unwrap();
         checked += 1;

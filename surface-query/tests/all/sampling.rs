@@ -17,6 +17,16 @@ proptest! {
     }
 
     #[test]
+    fn sampling_a_lattice_breaks_every_tie_by_index(
+        order in Just((0..216u32).collect::<Vec<_>>()).prop_shuffle(),
+    ) {
+        let points: Vec<Vec3> = (order.iter())
+            .map(|&i| Vec3::new((i % 6) as f32, (i / 6 % 6) as f32, (i / 36) as f32))
+            .collect();
+        prop_assert_eq!(farthest_points(&points, 216), oracle::farthest_points(&points, 216));
+    }
+
+    #[test]
     fn a_level_is_the_sampling_of_the_level_above(
         points in strategy::cloud(20..250, 1.0), ratio in 0.125f32..0.9,
     ) {

@@ -50,6 +50,10 @@ fn an_avatar_and_a_mesh_take_a_motion_and_are_read_back() {
     assert_eq!(names, [HOSTILE, "dance"]);
     assert!((character.animations[1].duration - 3.0 / 25.0).abs() < 1e-6);
 
+    let ply = out("person.ply");
+    done(&["export", text(&run), "--format", "ply", "--out", text(&ply), "--frame", "2"]);
+    assert!(std::fs::read(&ply).unwrap().starts_with(b"ply\nformat binary_little_endian 1.0\n"));
+
     let obj = out("person.obj");
     done(&["export", text(&run), "--format", "obj", "--out", text(&obj), "--frame", "1"]);
     assert!(out("person.mtl").exists() && out("person.png").exists());

@@ -255,6 +255,21 @@ fn where_the_disk_is_full_every_command_says_so_in_one_line_and_leaves_what_was_
 }
 
 #[test]
+fn a_training_whose_folder_vanishes_says_so_at_its_end() {
+    let run = folder("vanishing").join("run");
+    let child = start(&[training(&run, "300"), vec!["--checkpoint-every", "0.2"]].concat());
+    wait_for(&run.join("checkpoint.safetensors"));
+    while run.exists() {
+        // What is written meanwhile is in the way.
+        let _ = std::fs::remove_dir_all(&run);
+    }
+    let output = child.wait_with_output().unwrap();
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(3), "{said}");
+    assert!(said.contains("cannot be written") && !said.contains("panicked"), "{said}");
+}
+
+#[test]
 fn a_run_that_died_before_its_first_checkpoint_is_resumed_from_its_start() {
     let folder = folder("early");
     let (run, whole) = (folder.join("run"), folder.join("whole"));

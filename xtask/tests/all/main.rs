@@ -4,6 +4,8 @@
 mod cli;
 mod common;
 #[cfg(target_os = "linux")]
+mod death;
+#[cfg(target_os = "linux")]
 mod derived;
 mod export;
 #[cfg(target_os = "linux")]

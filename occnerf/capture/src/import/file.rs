@@ -23,7 +23,7 @@ const READ: [&str; 20] = [
     "pose", "shape", "global_t", "focal_l", "detection_all", "smpl_params_incam", "body_params_incam", "K_fullimg",
     "pred_", "mask",
 ];
-/// Further names of which the same is true, whole.
+/// Further names that are read, whole.
 const ALSO: [&str; 6] = ["beta", "trans", "triangle_ids", "baryc_coords", "hands_meanl", "hands_meanr"];
 
 fn is_read(name: &str) -> bool {

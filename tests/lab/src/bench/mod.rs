@@ -58,10 +58,10 @@ enum What {
     },
 }
 
-/// What a sweep is, and where it goes.
+/// Options of every sweep.
 #[derive(Args)]
 struct SweepArguments {
-    /// Where to write; what is there is not run again [default: runs/bench-NAME]
+    /// Output directory; runs already in it are kept [default: runs/bench-NAME]
     #[arg(long)]
     out: Option<PathBuf>,
     /// Fewer points and fewer steps: about 10 minutes on 2 cores

@@ -1,4 +1,4 @@
-//! Reading what a probe is given: every array is checked, and what is wrong is named.
+//! Input of a probe: every array is checked, and errors name the key.
 
 use std::ops::RangeInclusive;
 use std::path::Path;

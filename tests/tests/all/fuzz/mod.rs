@@ -26,6 +26,7 @@ use occnerf::{Config, Lpips, Person, Trainer, checkpoint_config};
 use rigged::{Character, load_mesh};
 use smpl::{BodyModel, MotionClip};
 use testkit::body::Random;
+use testkit::files::shared;
 
 /// Longest that a reader may take.
 const LONGEST: Duration = Duration::from_secs(1);
@@ -253,6 +254,9 @@ fn fits_of_estimators() {
     phalp.at(&place("phalp.pkl"), |path| imports(path, &video));
     let dir = place("easymocap");
     std::fs::create_dir_all(dir.join("smpl")).unwrap();
+    for (seed, name) in seeds::sam3d().into_iter().zip(["SAM 3D Body JSON", "SAM 3D Body pickle"]) {
+        attack(name, Form::Plain, vec![seed], 10).at(&place("sam3d.dat"), |path| imports(path, &video));
+    }
     let [frame, cameras] = seeds::easymocap();
     let lenses = |bytes: &[u8]| ["intri.yml", "extri.yml"].map(|name| std::fs::write(dir.join(name), bytes).unwrap());
     lenses(&cameras);
@@ -263,6 +267,17 @@ fn fits_of_estimators() {
         lenses(bytes);
         imports(&dir, &video)
     });
+    let Some(dir) = shared("estimators") else { return };
+    for (name, form) in [
+        ("wham/wham_output.pkl", Form::Plain),
+        ("prompthmr/results.pkl", Form::Plain),
+        ("gvhmr/hmr4d_results.pt", Form::Zip),
+        ("romp/video_results.npz", Form::Zip),
+    ] {
+        let (seed, path) = (std::fs::read(dir.join(name)).unwrap(), place(name.split('/').next_back().unwrap()));
+        let fit = Attack { most: 600 * MIB, ..attack(name, form, vec![seed], 5) };
+        fit.at(&path, |path| imports(path, &dir.join("frames")));
+    }
 }
 
 #[test]

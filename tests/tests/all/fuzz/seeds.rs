@@ -217,6 +217,31 @@ pub fn phalp() -> Vec<Vec<u8>> {
         .into()
 }
 
+/// SAM 3D Body's people of two frames as JSON and as a pickle: one with a focal length and a mask, one
+/// with pixels.
+pub fn sam3d() -> Vec<Vec<u8>> {
+    let points: Vec<[f64; 3]> = (0..70).map(|i| [f64::from(i % 7) * 0.125, f64::from(i / 7) * 0.125, 0.5]).collect();
+    let pixels: Vec<[f64; 2]> = points.iter().map(|p| [p[0] * 2.0 + 4.0, p[1] * 2.0 + 4.0]).collect();
+    let (place, mask) = ([0.0, 0.0, 4.0], [[1.0; 8]; 8]);
+    let json = serde_json::json!([
+        [{ "pred_keypoints_3d": points, "pred_cam_t": place, "focal_length": 9.0, "mask": mask.map(Vec::from) }],
+        [{ "pred_keypoints_3d": points, "pred_cam_t": place, "pred_keypoints_2d": pixels }],
+    ]);
+    let person = |[one, two]: [(&str, Py); 2]| {
+        let points = ("pred_keypoints_3d", Py::Array(vec![70, 3], points.as_flattened().to_vec()));
+        Py::List(vec![Py::record([points, ("pred_cam_t", Py::Array(vec![3], place.to_vec())), one, two])])
+    };
+    let first = person([
+        ("focal_length", Py::Array(Vec::new(), vec![9.0])),
+        ("mask", Py::Array(vec![8, 8], mask.as_flattened().to_vec())),
+    ]);
+    let second = person([
+        ("focal_length", Py::Raw(b"N".to_vec())),
+        ("pred_keypoints_2d", Py::Array(vec![70, 2], pixels.as_flattened().to_vec())),
+    ]);
+    vec![json.to_string().into_bytes(), Py::List(vec![first, second]).pickle()]
+}
+
 /// EasyMocap's file of a frame, and one of cameras that serves as both of them.
 pub fn easymocap() -> [Vec<u8>; 2] {
     let row = |count: usize| vec![vec![0.125; count]];
