@@ -202,6 +202,7 @@ impl RayMesh {
     /// the new end, or `None` to stop.
     #[inline(always)]
     fn traverse(&self, ray: &Ray, mut end: f32, mut visit: impl FnMut(&Leaf) -> Option<f32>) {
+        // obvhs' fixed stack drops what is pushed on its last place.
         fast_stack!((f32, u32), (96), self.depth + 1, stack, {
             if !self.nodes.is_empty() {
                 // The root.

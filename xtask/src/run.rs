@@ -341,7 +341,7 @@ pub fn replace(path: &Path, encode: impl FnOnce(&mut BufWriter<File>) -> Result<
         })
     });
     match failed {
-        Some(error) => Err(error),
+        Some(error) => Err(error).with_context(|| path.display().to_string()),
         None => written.map_err(unwritten(path)),
     }
 }

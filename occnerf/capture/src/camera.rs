@@ -47,7 +47,9 @@ impl Lens {
     pub fn read(record: &Item<'_>, k: &str, e: &str, pixel_centre: f32) -> Result<Self, CaptureError> {
         let (k, e) = (record.get(k)?, record.get(e)?);
         let (intrinsics, values) = (k.floats(&[Some(3), Some(3)])?, e.numbers(&[None, Some(4)])?);
-        if !matches!(values.get(12..), Some([] | [0.0, 0.0, 0.0, 1.0])) {
+        // Products of matrices end in numbers that are 0 and 1 in single precision.
+        let last: Option<Vec<f32>> = values.get(12..).map(|row| row.iter().map(|value| *value as f32).collect());
+        if !matches!(last.as_deref(), Some([] | [0.0, 0.0, 0.0, 1.0])) {
             let expected = "a rotation and a translation, with a last row of 0 0 0 1";
             return Err(e.invalid(expected, format!("{values:?}")));
         }

@@ -1,66 +1,81 @@
 //! JSON files as values of pickles.
 
+use std::cell::Cell;
 use std::fmt;
 use std::path::Path;
 
 use array_files::pickle::Value;
 use array_files::{Data, NdArray};
-use serde::de::{Deserialize, Deserializer, Error, MapAccess, SeqAccess, Visitor};
+use serde::de::{DeserializeSeed, Deserializer, Error, MapAccess, SeqAccess, Visitor};
 
 use super::CaptureError;
 use super::files::read_text;
 
+/// Most values outside of arrays, each of some hundred bytes.
+const MAX_VALUES: usize = 1 << 21;
+
 /// Reads a file of at most `most` bytes. Nested lists of numbers with equally long rows are arrays,
-/// gathered while they are read: memory is bounded by a few times the file's size, nesting by the
-/// parser.
+/// gathered while they are read: memory is bounded by [`MAX_VALUES`] and a few times the file's
+/// size, nesting by the parser.
 pub(super) fn read(path: &Path, most: u64) -> Result<Value, CaptureError> {
-    let parsed = serde_json::from_str(&read_text(path, most)?);
-    let Json(value) = parsed.map_err(|error| CaptureError::invalid(path, "the file", "JSON", error.to_string()))?;
-    Ok(value)
+    let (text, kept) = (read_text(path, most)?, Cell::new(0));
+    let mut parser = serde_json::Deserializer::from_str(&text);
+    let parsed = Json(&kept).deserialize(&mut parser).and_then(|value| parser.end().map(|()| value));
+    parsed.map_err(|error| CaptureError::invalid(path, "the file", "JSON", error.to_string()))
 }
 
-struct Json(Value);
+/// A value, and how many are kept outside of arrays.
+#[derive(Clone, Copy)]
+struct Json<'a>(&'a Cell<usize>);
 
-impl<'de> Deserialize<'de> for Json {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(JsonVisitor)
+impl Json<'_> {
+    fn keep<E: Error>(self, count: usize) -> Result<(), E> {
+        self.0.set(self.0.get() + count);
+        let fits = self.0.get() <= MAX_VALUES;
+        fits.then_some(()).ok_or_else(|| E::custom(format!("more than {MAX_VALUES} values outside of arrays")))
     }
 }
 
-struct JsonVisitor;
+impl<'de> DeserializeSeed<'de> for Json<'_> {
+    type Value = Value;
 
-impl<'de> Visitor<'de> for JsonVisitor {
-    type Value = Json;
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Json<'_> {
+    type Value = Value;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("JSON")
     }
 
-    fn visit_unit<E: Error>(self) -> Result<Json, E> {
-        Ok(Json(Value::None))
+    fn visit_unit<E: Error>(self) -> Result<Value, E> {
+        Ok(Value::None)
     }
 
-    fn visit_bool<E: Error>(self, value: bool) -> Result<Json, E> {
+    fn visit_bool<E: Error>(self, value: bool) -> Result<Value, E> {
         self.visit_f64(f64::from(u8::from(value)))
     }
 
-    fn visit_i64<E: Error>(self, value: i64) -> Result<Json, E> {
+    fn visit_i64<E: Error>(self, value: i64) -> Result<Value, E> {
         self.visit_f64(value as f64)
     }
 
-    fn visit_u64<E: Error>(self, value: u64) -> Result<Json, E> {
+    fn visit_u64<E: Error>(self, value: u64) -> Result<Value, E> {
         self.visit_f64(value as f64)
     }
 
-    fn visit_f64<E: Error>(self, value: f64) -> Result<Json, E> {
-        Ok(Json(Value::Float(value)))
+    fn visit_f64<E: Error>(self, value: f64) -> Result<Value, E> {
+        Ok(Value::Float(value))
     }
 
-    fn visit_str<E: Error>(self, text: &str) -> Result<Json, E> {
-        Ok(Json(Value::Str(text.to_owned())))
+    fn visit_str<E: Error>(self, text: &str) -> Result<Value, E> {
+        Ok(Value::Str(text.to_owned()))
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Json, A::Error> {
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Value, A::Error> {
         let mut items = Vec::new();
         while let Some(key) = map.next_key::<String>()? {
             // The innermost two names, such as frame and key, prefix an error.
@@ -68,21 +83,23 @@ impl<'de> Visitor<'de> for JsonVisitor {
                 0 | 1 => A::Error::custom(format!("{key}: {error}")),
                 _ => A::Error::custom(error),
             };
-            let Json(value) = map.next_value().map_err(|error| named(error.to_string()))?;
+            self.keep(1)?;
+            let value = map.next_value_seed(self).map_err(|error| named(error.to_string()))?;
             items.push((Value::Str(key), value));
         }
-        Ok(Json(Value::Dict(items)))
+        Ok(Value::Dict(items))
     }
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<Json, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<Value, A::Error> {
         let (mut stack, mut items) = (Stack::default(), Vec::new());
-        while let Some(Json(item)) = seq.next_element()? {
+        while let Some(item) = seq.next_element_seed(self)? {
             if !items.is_empty() || !stack.push(&item) {
+                self.keep(stack.count + 1)?;
                 items.extend(std::mem::take(&mut stack).into_items());
                 items.push(item);
             }
         }
-        Ok(Json(if stack.count > 0 { stack.into_array() } else { Value::List(items) }))
+        Ok(if stack.count > 0 { stack.into_array() } else { Value::List(items) })
     }
 }
 

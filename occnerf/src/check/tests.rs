@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use glam::{Affine3A, Mat3, Quat, Vec3};
-use smpl::{BodyModel, Placement};
+use smpl::{BodyModel, BoneNames, Placement};
 
 use super::*;
 use crate::capture::{ImportOptions, LoadOptions, import, load_capture};
@@ -129,10 +129,12 @@ fn made(mistake: Mistake, capture: &Capture, body: &BodyModel) -> Capture {
 #[derive(Clone, Copy, Debug)]
 enum Wrong {
     All(Mistake),
+    /// The fit in place of the pictures.
+    MirroredFit,
     Frames(Fault, usize),
 }
 
-const WRONGS: [Wrong; 33] = [
+const WRONGS: [Wrong; 34] = [
     Wrong::All(Mistake::CameraToWorld),
     Wrong::All(Mistake::CameraYUp),
     Wrong::All(Mistake::BodyUp(180)),
@@ -151,6 +153,7 @@ const WRONGS: [Wrong; 33] = [
     Wrong::All(Mistake::Scaled(2.0)),
     Wrong::All(Mistake::PrincipalPoint),
     Wrong::All(Mistake::Mirrored),
+    Wrong::MirroredFit,
     Wrong::All(Mistake::MaskInverted),
     Wrong::All(Mistake::FrameShift(1)),
     Wrong::All(Mistake::FrameShift(-1)),
@@ -177,6 +180,7 @@ impl Wrong {
         let mut wrong = capture.clone();
         match self {
             Self::All(mistake) => return made(mistake, capture, body),
+            Self::MirroredFit => wrong.train.iter_mut().for_each(|frame| mirror(frame, body)),
             Self::Frames(fault, _) => {
                 let frames = wrong.train.iter_mut().enumerate().filter(|(i, _)| self.is_in(*i));
                 frames.for_each(|(_, frame)| corrupt(fault, frame, body));
@@ -189,6 +193,7 @@ impl Wrong {
     fn judged(self, found: &Check) -> [bool; 3] {
         let expected = match self {
             Self::All(mistake) => mistake,
+            Self::MirroredFit => Mistake::Mirrored,
             Self::Frames(fault, _) => {
                 let named = |fault: Fault, here: bool| {
                     let frames = found.frames.iter().enumerate().filter(|(i, _)| self.is_in(*i) == here);
@@ -212,6 +217,38 @@ impl Wrong {
             (first, expected) => first == expected,
         };
         [true, std::mem::discriminant(first) == std::mem::discriminant(&expected), advice]
+    }
+}
+
+/// Mirrors a frame's body, left to right as its camera sees it.
+fn mirror(frame: &mut Frame, body: &BodyModel) {
+    let names = BoneNames::Smpl.of_body(body.num_joints());
+    let twin = |name: &String| match name.strip_prefix("left_") {
+        Some(rest) => format!("right_{rest}"),
+        None => name.strip_prefix("right_").map_or(name.clone(), |rest| format!("left_{rest}")),
+    };
+    let pose = std::mem::take(&mut frame.pose);
+    let shaped = body.shaped(&frame.betas);
+    let pelvis = body.pose(&shaped, &pose, frame.placement).joints[0];
+    let flip = |axis: Vec3| Vec3::new(axis.x, -axis.y, -axis.z);
+    frame.pose =
+        names.iter().map(|name| flip(pose[names.iter().position(|other| *other == twin(name)).unwrap()])).collect();
+    let aside = Mat3::from_diagonal(Vec3::new(-1.0, 1.0, 1.0));
+    let camera = frame.camera.world_to_camera;
+    let turned = |axis: Vec3| {
+        let (camera, turn) = (Mat3::from(camera.matrix3), Mat3::from_quat(Quat::from_scaled_axis(axis)));
+        Quat::from_mat3(&(camera.transpose() * aside * camera * turn * aside)).to_scaled_axis()
+    };
+    let to = camera.inverse().transform_point3(aside * camera.transform_point3(pelvis));
+    match &mut frame.placement {
+        Placement::Pelvis { translation } => {
+            frame.pose[0] = turned(pose[0]);
+            *translation += to - pelvis;
+        }
+        Placement::Origin { rotation, translation } => {
+            *rotation = turned(*rotation);
+            *translation = to - Quat::from_scaled_axis(*rotation) * shaped.joints[0];
+        }
     }
 }
 
@@ -320,6 +357,44 @@ fn masks_of_noise_are_said_to_fit_nothing() {
         frame.source.edit(move |pixels| pixels.mask.iter_mut().enumerate().for_each(|(n, level)| *level = noise(n)));
     }
     assert_eq!(likely(&capture, &body, small_views(&capture).unwrap()).unwrap(), [Mistake::NoFit]);
+}
+
+#[test]
+fn a_silhouette_is_where_rays_hit_also_around_a_camera_within_the_body() {
+    let body = BodyModel::embedded();
+    let capture = small_demo(&body, 3);
+    for frame in capture.train.iter().step_by(20) {
+        let posed = body.pose(&body.shaped(&frame.betas), &frame.pose, frame.placement);
+        let mesh = RayMesh::new(&posed.vertices, &body.faces).unwrap();
+        let mut within = frame.camera;
+        within.world_to_camera.translation -= within.world_to_camera.transform_point3a(posed.joints[0].into());
+        for camera in [frame.camera, within] {
+            let covered = silhouette(&posed.vertices, &body.faces, &camera).unwrap();
+            let wrong = covered.iter().enumerate().filter(|(i, covered)| {
+                let (x, y) = (*i as u32 % camera.width, *i as u32 / camera.width);
+                let ray = camera.ray(x as f32 + 0.5, y as f32 + 0.5);
+                mesh.first_hit(ray.origin, ray.direction).is_some() != **covered
+            });
+            // Rounding at the outline.
+            assert!(covered.iter().filter(|c| **c).count() > 500 && wrong.count() <= 3);
+        }
+    }
+}
+
+#[test]
+fn jumps_empty_masks_and_frames_that_do_not_fit_are_marked() {
+    let body = BodyModel::embedded();
+    let mut capture = small_demo(&body, 1);
+    capture.train[10].source.edit(|pixels| pixels.mask.fill(0.0));
+    capture.train[20].camera.world_to_camera.translation.x += 1.5;
+    capture.train[30].pose.iter_mut().skip(1).for_each(|axis| *axis += Vec3::splat(0.9));
+    let found = check(&capture, &body).unwrap();
+    let faults = |i: usize| &found.frames[i].faults;
+    assert_eq!(faults(10), &[Fault::EmptyMask]);
+    assert!(faults(20).contains(&Fault::Overlap) && faults(20).contains(&Fault::PlaceJump), "{:?}", faults(20));
+    assert!(faults(21).contains(&Fault::PlaceJump));
+    assert!(faults(30).contains(&Fault::PoseJump) && faults(31).contains(&Fault::PoseJump), "{:?}", faults(30));
+    assert!(faults(40).is_empty() && found.mistakes.is_empty());
 }
 
 #[test]

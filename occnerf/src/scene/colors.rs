@@ -52,8 +52,9 @@ impl PriorColors {
         let most = MOST.min(most_times(faces.len()));
         let times = pixel.map_or(0, |pixel| times_until(prior, faces, EDGE * pixel, most));
         let mesh = Subdivided::new(prior.len(), faces, times);
-        // Terms of Σ s c and Σ s² for colours c under the light s, and reliabilities.
-        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, f32, f32)>, Error> {
+        // Terms of Σ s c for colours c under the light s, and of Σ s², the reliabilities times the
+        // foreshortening, and the reliabilities.
+        let shown = |frame: usize| -> Result<Vec<(usize, Vec3, Vec3)>, Error> {
             let seen = scene.seen_in(frame, &mesh.anchors)?;
             let view = &scene.train[frame].view;
             let eye = view.camera.centre_of_projection();
@@ -62,7 +63,7 @@ impl PriorColors {
                 let cosine = normal.dot((eye - place).normalize_or_zero());
                 let trust = reliability.at(depth as f32, cosine);
                 let (size, shade) = (trust * cosine.max(SLANT), light.on(normal));
-                (v as usize, size * shade * color, size * shade * shade, trust)
+                (v as usize, size * shade * color, Vec3::new(size * shade * shade, size, trust))
             };
             let hands = hands.as_ref().map(|color| color.in_frame(&scene.body.model, view));
             let is_hand_beside = |v: u32, color: Vec3| {
@@ -76,21 +77,20 @@ impl PriorColors {
                 |&&((v, color, _), depth): &&(ColorObservation, usize)| depth > scene.edge && !is_hand_beside(v, color);
             Ok(seen.iter().filter(is_allowed).map(term).collect())
         };
-        let mut sums = vec![(Vec3::ZERO, 0.0, 0.0); mesh.anchors.len()];
+        let mut sums = vec![(Vec3::ZERO, Vec3::ZERO); mesh.anchors.len()];
         for first in (0..scene.train.len()).step_by(TOGETHER) {
             let frames = first..(first + TOGETHER).min(scene.train.len());
             let found: Result<Vec<_>, Error> = frames.into_par_iter().map(shown).collect();
-            for (v, sum, squares, trust) in found?.into_iter().flatten() {
-                sums[v] = (sums[v].0 + sum, sums[v].1 + squares, sums[v].2 + trust);
+            for (v, sum, weights) in found?.into_iter().flatten() {
+                sums[v] = (sums[v].0 + sum, sums[v].1 + weights);
             }
         }
         let least = reliability.disagreement * EVIDENCE;
-        let is_seen = |sum: &(Vec3, f32, f32)| sum.1 > GRAZING * sum.2 && sum.2 >= least;
-        let seen: Vec<bool> = sums.iter().map(is_seen).collect();
-        let mut colors: Vec<Vec3> =
-            sums.iter().map(|(sum, squares, _)| *sum / squares.max(f32::MIN_POSITIVE)).collect();
+        let is_seen = |weights: Vec3| weights.x > 0.0 && weights.y > GRAZING * weights.z && weights.z >= least;
+        let seen: Vec<bool> = sums.iter().map(|sum| is_seen(sum.1)).collect();
+        let mut colors: Vec<Vec3> = sums.iter().map(|(sum, weights)| *sum / weights.x.max(f32::MIN_POSITIVE)).collect();
         let (vertices, between) = colors.split_at_mut(prior.len());
-        let foreshortening = |v: usize| if seen[v] { sums[v].1 / sums[v].2 } else { 0.0 };
+        let foreshortening = |v: usize| if seen[v] { sums[v].1.y / sums[v].1.z } else { 0.0 };
         complete(&scene.body, vertices, &(0..prior.len()).map(foreshortening).collect::<Vec<_>>());
         let rest = between.iter_mut().zip(&mesh.anchors[prior.len()..]).zip(&seen[prior.len()..]);
         rest.filter(|(_, seen)| !**seen).for_each(|((color, anchor), _)| *color = anchor.mix(vertices));

@@ -185,4 +185,25 @@ mod tests {
         assert_eq!(adam.step(0.1, 0.99, &mut p, &[f32::NAN, f32::INFINITY, 1.0]), 2);
         assert!(p.iter().all(|p| p.is_finite()) && p[0] == 1.0 && p[2] < 1.0);
     }
+
+    #[test]
+    fn first_step_moves_each_parameter_by_the_rate_against_its_sign() {
+        let mut adam = Adam::new(3);
+        let mut p = vec![1.0, 2.0, 3.0];
+        assert_eq!(adam.step(0.1, 0.99, &mut p, &[5.0, -0.001, 0.0]), 0);
+        for (p, expected) in p.iter().zip([0.9, 2.1, 3.0]) {
+            assert!((p - expected).abs() < 1e-5, "{p} {expected}");
+        }
+    }
+
+    #[test]
+    fn minimum_of_a_quadratic_is_found() {
+        let mut adam = Adam::new(2);
+        let mut p = vec![4.0f32, -3.0];
+        for _ in 0..2000 {
+            let g = [2.0 * (p[0] - 1.0), 20.0 * (p[1] - 2.0)];
+            adam.step(0.02, 0.99, &mut p, &g);
+        }
+        assert!((p[0] - 1.0).abs() < 0.02 && (p[1] - 2.0).abs() < 0.02, "{p:?}");
+    }
 }

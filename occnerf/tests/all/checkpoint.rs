@@ -70,6 +70,17 @@ fn a_good_checkpoint_is_accepted_and_saved_again_byte_for_byte() {
     assert!(resume(scene(), &forged(good(), |_, _| ())).is_ok());
 }
 
+#[test]
+fn a_checkpoint_cut_short_anywhere_is_refused() {
+    let bytes = good();
+    let header = 8 + u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let lengths = (0..header).step_by(13).chain(header - 3..header + 3).chain((header..bytes.len()).step_by(997));
+    for length in lengths.chain([bytes.len() - 1]) {
+        refused(scene(), &bytes[..length], &format!("{length} of {} bytes", bytes.len()));
+    }
+    refused(scene(), &[bytes, b"more"].concat(), "bytes behind the end");
+}
+
 /// The checkpoint with the bytes of an array changed from a number on.
 fn with_bytes(bytes: &[u8], name: &str, at: usize, by: f32) -> Vec<u8> {
     forged(bytes, |_, arrays| arrays.get_mut(name).unwrap().2[at..at + 4].copy_from_slice(&by.to_le_bytes()))

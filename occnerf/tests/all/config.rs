@@ -72,6 +72,26 @@ fn values_out_of_range_are_refused_before_anything_is_built() {
 }
 
 #[test]
+fn encodings_that_cannot_be_built_are_errors_too() {
+    type Change = fn(&mut Config);
+    let changes: [(&str, Change); 6] = [
+        ("no levels", |c| c.encoding.levels = 0),
+        ("too many levels", |c| c.encoding.levels = 1000),
+        ("no features", |c| c.encoding.features = 0),
+        ("a table without end", |c| c.encoding.log2_table_size = 60),
+        ("no cells", |c| c.encoding.n_min = 0),
+        ("finest below coarsest", |c| c.encoding.n_max = 3),
+    ];
+    for (name, change) in changes {
+        for method in [Method::Occnerf, Method::HashPoint] {
+            let mut config = common::config(method);
+            change(&mut config);
+            assert!(Trainer::new(common::scene(), config).is_err(), "{name}");
+        }
+    }
+}
+
+#[test]
 fn every_component_can_be_switched_off_and_the_rest_still_trains() {
     for component in [Component::Surface, Component::Attention, Component::Completeness, Component::Perceptual] {
         let mut config = common::config(Method::Occnerf);

@@ -114,12 +114,24 @@ fn options_of_an_import_do_what_they_say() {
     let linked = std::fs::symlink_metadata(&picture).unwrap().is_symlink();
     assert_eq!(linked, cfg!(unix));
 
+    let (other, out) = run("person", |options| options.person = Some("1".to_owned()));
+    assert_eq!((other.frames, other.unfitted), (6, [9, 5, 0]));
+    assert!(out.join("masks/000010.png").is_file() && !out.join("masks/000009.png").exists());
+
     let (_, out) = run("copy", |options| (options.copy, options.occluder_objects) = (true, vec![2]));
     assert!(!std::fs::symlink_metadata(out.join("images/000001.png")).unwrap().is_symlink());
     let body = BodyModel::load(&out.join("body.safetensors")).unwrap();
     let capture = load_capture(&out, &body, &LoadOptions::default()).unwrap();
     let pixels = capture.train[0].pixels().unwrap();
     assert!(pixels.occluder.as_ref().unwrap().iter().filter(|o| **o).count() > 1000);
+
+    let (focal, _) = run("focal", |options| options.focal = Some(415.0));
+    assert_eq!(focal.focal, 415.0);
+
+    // Eight masks of twenty frames.
+    let (few, _) =
+        run("few", |options| options.masks = options.masks.as_ref().map(|m| m.with_file_name("grounded_sam2")));
+    assert_eq!((few.frames, few.unmasked), (8, 12));
 }
 
 #[test]

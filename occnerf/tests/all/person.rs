@@ -8,7 +8,8 @@ use common::{body, capture, config, scene};
 use glam::Vec3;
 use occnerf::capture::{Mended, Registered};
 use occnerf::{
-    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, Renderer, Scene, Trainer, mend_masks,
+    Error, FieldRenderer, Method, Model, MotionKind, Person, PriorColors, PriorRenderer, Renderer, Scene, Trainer,
+    mend_masks,
 };
 use smpl::BodyModel;
 use synth::{DemoConfig, demo};
@@ -132,6 +133,20 @@ fn a_run_goes_on_with_the_colours_that_it_began_with() {
     let (fresh_start, resumed) = (first(&prepared()), first(&prepared().with_colors(kept)));
     assert_ne!(fresh_start, resumed);
     assert_eq!(prepared().with_colors(began.clone()).colors().unwrap(), &began);
+}
+
+#[test]
+fn the_prior_of_a_run_draws_the_same_bits_too() {
+    let dir = Directory::new("person-prior");
+    let colors = PriorColors::measure(scene()).unwrap();
+    let run = dir.file("");
+    Person::save(&run, &scene().registered, body(), &colors).unwrap();
+    let person = Person::load(&run, &config(Method::Prior)).unwrap();
+    assert_eq!((person.scene.as_str(), &person.colors), (scene().name.as_str(), &colors));
+    let view = &scene().train[1].view;
+    let drawn = PriorRenderer::new(&scene().body, &colors).render(view, Vec3::ONE).unwrap();
+    let again = PriorRenderer::new(&person.body, &person.colors).render(&person.frames[1], Vec3::ONE).unwrap();
+    assert!(drawn.image.pixels == again.image.pixels);
 }
 
 #[test]

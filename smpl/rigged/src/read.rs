@@ -129,11 +129,11 @@ fn ignored(root: &Root) -> Vec<String> {
 /// JSON and binary chunk of a `.glb` (glTF 2.0, section 4.4).
 fn container<'a>(file: &str, bytes: &'a [u8]) -> Result<Glb<'a>, Error> {
     let invalid = |message: &str| Error::invalid(file, "container", message);
-    // `Glb` subtracts the length of the header unchecked.
-    if bytes.get(8..12).is_none_or(|length| length[0] < 12 && length[1..] == [0; 3]) {
-        return Err(invalid("truncated"));
-    }
-    Glb::from_slice(bytes).map_err(|error| invalid(&error.to_string()))
+    let length = bytes.get(8..12).and_then(|length| length.try_into().ok()).map_or(0, u32::from_le_bytes);
+    // `Glb` subtracts the length of the header unchecked, and takes bytes behind the end for a chunk.
+    let whole = bytes.get(..length as usize).filter(|whole| whole.len() >= 12);
+    let whole = whole.ok_or_else(|| invalid("truncated"))?;
+    Glb::from_slice(whole).map_err(|error| invalid(&error.to_string()))
 }
 
 fn nodes(source: &Source<'_>) -> Result<Vec<Node>, Error> {

@@ -63,7 +63,14 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
     std::fs::copy(other.join("checkpoint.safetensors"), run.join("checkpoint.safetensors")).unwrap();
     refused(&["eval", text(&run)], &["checkpoint.safetensors", "of another run"]);
     refused(&export, &["of another run"]);
-    // One that is cut off, and none.
+    // A motion of another skeleton; then a checkpoint that is cut off, and none.
+    let motion = folder.join("other.npz");
+    crate::export::clip(&motion, 31);
+    let drawn = ["render", text(&run), "pose", "--baked", "--motion", text(&motion)];
+    refused(
+        &["render", text(&other), "pose", "--baked", "--motion", text(&motion)],
+        &["other.npz", "another skeleton"],
+    );
     let whole = bytes(&other.join("checkpoint.safetensors"));
     std::fs::write(run.join("checkpoint.safetensors"), &whole[..whole.len() / 2]).unwrap();
     std::fs::remove_file(&avatar).unwrap();
@@ -71,6 +78,7 @@ fn an_avatar_of_an_earlier_training_is_baked_again_whatever_its_time() {
         refused(&export, words);
         refused(&["view", text(&run)], words);
         refused(&["render", text(&run), "tpose", "--baked"], words);
+        refused(&drawn, words);
         let _ = std::fs::remove_file(run.join("checkpoint.safetensors"));
     }
 }
@@ -134,14 +142,17 @@ fn devices_and_pipes_are_read_up_to_a_bound_and_written_to_as_they_are() {
     refusal(&["train", text(&capture), "--lpips", text(&pipe)], "pipe.npz");
     let images = capture.join("images");
     refusal(&["import", "--frames", text(&images), "--fit", text(&pipe), "--out", "x"], "pipe.npz");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
-    command.args(["train", "--list", text(&pipe), "--out", text(&folder.join("l"))]).stdout(Stdio::null());
-    let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
-    let lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
-    let first = lines.into_iter().find(|line| line.contains("reading")).unwrap_or_default();
-    assert!(first.contains("pipe.npz: 2 s"), "{first}");
-    std::fs::write(&pipe, "no-such-capture").unwrap();
-    assert_eq!(child.wait().unwrap().code(), Some(1));
+    let export = ["export", text(&run), "--out", text(&glb), "--motion", text(&pipe)];
+    for waits in [&["train", "--list", text(&pipe), "--out", text(&folder.join("l"))][..], &export] {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_xtask"));
+        command.args(waits).env_remove("SMPL_MODEL").stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut child = command.spawn().unwrap();
+        let lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
+        let first = lines.into_iter().find(|line| line.contains("reading")).unwrap_or_default();
+        assert!(first.contains("pipe.npz: 2 s"), "{first}");
+        std::fs::write(&pipe, "no-such-capture").unwrap();
+        assert_eq!(child.wait().unwrap().code(), Some(1));
+    }
     // In a run without a writer.
     let metrics = run.join("train.jsonl");
     std::fs::remove_file(&metrics).unwrap();

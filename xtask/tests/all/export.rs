@@ -26,7 +26,7 @@ fn run(name: &str) -> PathBuf {
 }
 
 /// Motion capture of this many joints.
-fn clip(path: &Path, joints: usize) {
+pub fn clip(path: &Path, joints: usize) {
     let poses = Data::F32(vec![0.1; 4 * 3 * joints]);
     let arrays = [
         ("poses", NdArray { shape: vec![4, 3 * joints], data: poses }),

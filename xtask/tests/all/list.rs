@@ -32,6 +32,8 @@ fn a_list_of_scenes_is_trained_in_parts() {
         assert!(output.status.code() == Some(1) && said.contains(words), "{said}");
         assert!(bytes(&out.join("a/checkpoint.safetensors")) == checkpoint);
     };
+    let longer = command.map(|word| if word == "2" { "3" } else { word });
+    assert!(String::from_utf8_lossy(&xtask(&longer).stdout).contains("holds a run with other settings"));
     for more in [&["--seed", "2"][..], &["--set", "samples=8"]] {
         fails(more, "holds a run with other settings");
         refused(&with(&[more, &["--merge"]].concat()), &["have no scores yet"]);

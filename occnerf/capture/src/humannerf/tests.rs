@@ -180,9 +180,11 @@ fn files_and_frames_that_are_missing_are_named() {
 #[test]
 fn values_that_cannot_be() {
     let far = |x: f64| array(&[3], &[0.0, x, 0.0]);
-    let cases: [(&str, Py, &[&str]); 7] = [
+    let cases: [(&str, Py, &[&str]); 9] = [
         ("Rh", Py::text("nothing"), &["an array", "str"]),
+        ("Rh", array(&[1, 4], &[0.0; 4]), &["[3]", "[4]"]),
         ("Rh", far(-1e30), &["1000"]),
+        ("poses", array(&[6], &[f64::NAN; 6]), &["finite", "NaN"]),
         ("Th", far(f64::INFINITY), &["finite", "inf"]),
         ("Th", far(-1e38), &["10000000"]),
         ("poses", array(&[6], &[0.5; 6]), &["zero root"]),
@@ -194,6 +196,9 @@ fn values_that_cannot_be() {
         holds(&[&["mesh_infos.pkl", &full], words].concat(), |f| *f.mesh_infos.at(&[FRAME, key]) = value);
     }
     holds(&["mesh_infos.pkl", FRAME, "dictionary", "numpy array"], |f| *f.mesh_infos.at(&[FRAME]) = far(0.0));
+    holds(&["cameras.pkl", "extrinsics", "finite", "NaN"], |f| {
+        *f.cameras.at(&[FRAME, "extrinsics"]) = array(&[4, 4], &[f64::NAN; 16]);
+    });
     holds(&["frame_000001.Rh", "no such key", "Th, poses"], |f| f.mesh_infos.remove(&[FRAME, "Rh"]));
     holds(&["canonical_joints.pkl", "avg_betas"], |f| *f.canonical.at(&["avg_betas"]) = array(&[0], &[]));
     holds(&["canonical_joints.pkl", "joints", "body model"], |f| {

@@ -38,10 +38,10 @@ pub(super) fn peoplesnapshot(tool: Tool, fit: &Item<'_>, video: &Video) -> Resul
         (true, false) => (fit.table(None, &[("global_orient", 3), ("body_pose", 3 * SMPL - 3)])?, "betas", "transl"),
     };
     let (shape, place) = (fit.get(shape)?, fit.get(place)?);
-    let betas = shape.values()?.1;
-    if betas.is_empty() || !betas.len().is_multiple_of(BETAS) {
-        return Err(shape.invalid(format!("shape [1, {BETAS}]"), format!("{} numbers", betas.len())));
-    }
+    let betas = match is_prepared {
+        true => shape.numbers(&[Some(1), Some(BETAS)])?,
+        false => shape.rows(BETAS)?.into_iter().next().ok_or_else(|| shape.invalid("a row", "none"))?,
+    };
     let places = place.rows(3)?;
     place.as_long(rows.len(), places.len())?;
     // The frames of a partial split are unknown.
@@ -52,7 +52,7 @@ pub(super) fn peoplesnapshot(tool: Tool, fit: &Item<'_>, video: &Video) -> Resul
     let lens = pinhole(&camera.get("intrinsic")?.numbers(&[Some(3), Some(3)])?);
     let extrinsic = camera.get("extrinsic")?;
     let (turn, moved) = extrinsic.rigid(&extrinsic.numbers(&[Some(4), Some(4)])?, ORTHONORMAL)?;
-    rows.iter_mut().zip(&places).for_each(|(row, place)| row.extend(betas[..BETAS].iter().chain(place)));
+    rows.iter_mut().zip(&places).for_each(|(row, place)| row.extend(betas.iter().chain(place)));
     let frames = rows.iter().enumerate().map(|(index, row)| {
         let still = FitFrame::still(index, row, lens);
         let offset = turn * still.offset + moved;

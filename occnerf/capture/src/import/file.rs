@@ -18,13 +18,14 @@ const MAX_TEXT: u64 = 256 << 20;
 
 /// First parts of the names that are read of archives, which may hold much else.
 #[rustfmt::skip]
-const READ: [&str; 20] = [
+const READ: [&str; 18] = [
     "results", "transl", "betas", "thetas", "body_pose", "global_orient", "intrinsic", "extrinsic", "height", "width",
-    "pose", "shape", "global_t", "focal_l", "detection_all", "smpl_params_incam", "body_params_incam", "K_fullimg",
+    "global_t", "focal_l", "detection_all", "smpl_params_incam", "body_params_incam", "K_fullimg",
     "pred_", "mask",
 ];
 /// Further names that are read, whole.
-const ALSO: [&str; 6] = ["beta", "trans", "triangle_ids", "baryc_coords", "hands_meanl", "hands_meanr"];
+const ALSO: [&str; 8] =
+    ["pose", "shape", "beta", "trans", "triangle_ids", "baryc_coords", "hands_meanl", "hands_meanr"];
 
 fn is_read(name: &str) -> bool {
     READ.iter().any(|start| name.starts_with(start)) || ALSO.contains(&name)

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use array_files::npz::read_npy;
+use array_files::npz::{Npz, read_npy};
 use array_files::{Data, NdArray};
 use png::{ColorType, Decoder, Limits};
 
@@ -249,6 +249,12 @@ type Joined = (BTreeMap<usize, Source>, Vec<String>);
 /// Masks (N,H,W), (N,1,H,W) or (N,H,W,1) in one file.
 fn stack(path: &Path, video: &Video) -> Result<Joined, CaptureError> {
     let expected = "masks (frames, height, width), or the same with an axis of 1";
+    if has_extension(path, &["npz"]) {
+        let keys = Npz::open(path)?.keys().join(", ");
+        if keys.contains(", ") {
+            return Err(CaptureError::invalid(path, "keys", "one array of masks", keys));
+        }
+    }
     let array = array(path, expected, |shape| matches!(shape, [_, _, _] | [_, 1, _, _] | [_, _, _, 1]))?;
     let (n, [height, width]) = match array.shape[..] {
         [n, height, width] | [n, 1, height, width] | [n, height, width, _] => (n, [height, width]),
@@ -321,7 +327,7 @@ pub(super) struct Levels {
 impl Levels {
     /// Reads a PNG, JPEG or `.npy` file.
     pub fn load(path: &Path) -> Result<Self, CaptureError> {
-        if path.extension().is_some_and(|e| e == "npy") {
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npy")) {
             return Self::from_array(path, &read_npy(path)?);
         }
         if let Some(levels) = indexed(path)? {

@@ -112,7 +112,7 @@ pub(super) fn parse(path: &Path, value: &Value, video: &Video) -> Result<Fit, Ca
     if with(&["pose", "shape", "global_t", "focal_l", "detection_all"]) {
         return tools::cliff(&root, video);
     }
-    if with(&["K_fullimg"]) {
+    if ["K_fullimg", "smpl_params_incam", "body_params_incam"].iter().any(|key| with(&[key])) {
         return tools::gvhmr(&root, video);
     }
     let entries = root.entries()?;

@@ -31,7 +31,8 @@ impl Rle {
             Value::Bytes(bytes) => decompressed(bytes, most),
             Value::Str(text) => decompressed(text.as_bytes(), most),
             _ => {
-                let run = |n: &f64| u32::try_from(*n as i64).map_err(|_| format!("a run of {n}"));
+                let whole = |n: &f64| (n.fract() == 0.0).then(|| u32::try_from(*n as i64).ok()).flatten();
+                let run = |n: &f64| whole(n).ok_or_else(|| format!("a run of {n}"));
                 counts.numbers(&[None])?.iter().map(run).collect()
             }
         };
@@ -180,6 +181,7 @@ mod tests {
             ([2, 2], ones(5), "found 5"),
             ([2, 2], ones(3), "found 3"),
             ([2, 2], ones(-1), "a run of -1"),
+            ([2, 2], Value::List(vec![Value::Float(1.5), Value::Float(3.2)]), "a run of 1.5"),
             ([0, 2], ones(0), "size"),
             ([1 << 40, 2], ones(0), "8192"),
             ([2, 2], Value::Bytes(vec![255]), "byte 255"),

@@ -3,8 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use array_files::NdArray;
-use array_files::npz::Npz;
-use array_files::pickle::Value;
+use array_files::npz::{self, Npz};
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use smpl::BodyModel;
@@ -325,7 +324,7 @@ fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
     for shape in [&[3, 2, 4][..], &[3, 1, 2, 4], &[3, 2, 4, 1]] {
         dir.write("stack.npy", npy(shape, &values));
         let array = array_files::NdArray { shape: shape.to_vec(), data: data.clone() };
-        array_files::npz::write(&dir.path().join("stack.npz"), &[("masks", array)]).unwrap();
+        npz::write(&dir.path().join("stack.npz"), &[("masks", array)]).unwrap();
         for file in ["stack.npy", "stack.npz"] {
             let path = dir.path().join(file);
             let masks = Masks::open(&path, &ImportOptions::default(), &video).unwrap();
@@ -349,18 +348,23 @@ fn gvhmr_saved_again_with_joined_names_is_the_same() {
     let video = Video::list(&dir.join("frames")).unwrap();
     let path = dir.join("gvhmr/hmr4d_results.pt");
     let whole = file::value(&path, "").unwrap();
-    let frames = |value: &Value| {
-        let fit = read::parse(&path, value, &video).unwrap();
+    let out = Directory::new("import-gvhmr-again");
+    let frames = |path: &Path| {
+        let (fit, _) = read::read(path, &video).unwrap();
         assert_eq!(fit.tool, Tool::Gvhmr);
         let person = fit.people.into_iter().next().unwrap();
         person.frames.into_iter().map(|f| (f.pose, f.betas, f.offset, f.focal)).collect::<Vec<_>>()
     };
     let incam = Item::new(&path, &whole).get("smpl_params_incam").unwrap().entries().unwrap();
     for prefix in ["smpl_params_incam", "body_params_incam"] {
-        let below = incam.iter().map(|(key, item)| (format!("{prefix}_{key}"), item.value.clone()));
-        let others = [("K_fullimg", whole.get("K_fullimg").unwrap().clone()), ("gender", Value::None)];
-        let all = below.chain(others.map(|(key, value)| (key.to_owned(), value)));
-        assert_eq!(frames(&Value::Dict(all.map(|(key, value)| (Value::Str(key), value)).collect())), frames(&whole));
+        let array = |item: &Item<'_>| item.array().unwrap().into_owned();
+        let below = incam.iter().map(|(key, item)| (format!("{prefix}_{key}"), array(item)));
+        let camera = ("K_fullimg".to_owned(), array(&Item::new(&path, &whole).get("K_fullimg").unwrap()));
+        let arrays: Vec<_> = below.chain([camera]).collect();
+        let named: Vec<_> = arrays.iter().map(|(key, array)| (key.as_str(), array.clone())).collect();
+        let again = out.path().join("gvhmr.npz");
+        npz::write(&again, &named).unwrap();
+        assert_eq!(frames(&again), frames(&path));
     }
 }
 

@@ -28,7 +28,7 @@ pub(super) fn wham(people: &Entries<'_>, video: &Video) -> Result<Fit, CaptureEr
         Ok(Person::new(id, frames))
     };
     // Dropped tracks are empty.
-    let begun = people.iter().filter(|(_, item)| item.find("pose").is_some());
+    let begun = people.iter().filter(|(_, item)| item.value.get("pose").is_some());
     Ok(Fit::of_video(Tool::Wham, begun.map(person).collect::<Result<_, CaptureError>>()?))
 }
 

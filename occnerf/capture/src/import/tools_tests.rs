@@ -111,6 +111,8 @@ fn rows_of_two_people_of_cliff_in_any_order_are_two_people() {
         .filter(|row| *row != (5, true))
         .collect();
     let n = rows.len();
+    let out = Directory::new("import-cliff");
+    let path = out.path().join("clip_cliff_hr48.npz");
     let of = |row: &(usize, bool)| pelvises[row.0] - joint + DVec3::Z * if row.1 { 3.0 } else { 0.0 };
     for matrices in [false, true] {
         let values = |(i, _): &(usize, bool)| match matrices {
@@ -120,14 +122,16 @@ fn rows_of_two_people_of_cliff_in_any_order_are_two_people() {
         let with = |first: f64| {
             let detected = rows.iter().flat_map(|row| [row.0 as f64 * first, 1.0, 2.0, 3.0, 4.0, 0.9, 0.9, 0.0]);
             let shape: &[usize] = if matrices { &[n, 24, 3, 3] } else { &[n, 72] };
-            let value = dictionary([
+            let arrays = [
                 ("pose", array(shape, rows.iter().flat_map(values))),
                 ("shape", array(&[n, 10], betas.repeat(n))),
                 ("global_t", array(&[n, 3], flat(rows.iter().map(of)))),
+                ("pred_joints", array(&[n, 2, 3], vec![0.0; 6 * n])),
                 ("focal_l", array(&[n], vec![362.0; n])),
                 ("detection_all", array(&[n, 8], detected)),
-            ]);
-            parse(&value, &video)
+            ];
+            npz::write(&path, &arrays).unwrap();
+            read::read(&path, &video).map(|(fit, _)| fit)
         };
         let fit = with(1.0).unwrap();
         let counts: Vec<usize> = fit.people.iter().map(|person| person.frames.len()).collect();
@@ -195,6 +199,12 @@ fn what_peoplesnapshot_prepares_of_a_known_motion_is_that_motion() {
     cameras("cameras.npz", 1080.0);
     refused(read("poses.npz"), &["cameras.npz", "width", "256", "1080"]);
     cameras("cameras.npz", 256.0);
+    let [_, place] = &both;
+    for shape in [vec![300], vec![10, n], vec![n, 10]] {
+        let shape = array(&shape, vec![0.0; shape.iter().product()]);
+        write("poses.npz", &[("betas", shape), place.clone(), ("thetas", part(0, 72))]);
+        refused(read("poses.npz"), &["poses.npz", "betas", "[1, 10]"]);
+    }
     let few = [("thetas", array(&[2, 72], [0.0; 144])), ("transl", array(&[2, 3], [0.0; 6]))];
     write("poses.npz", &[&both[..1], &few[..]].concat());
     refused(read("poses.npz"), &["poses.npz", "transl", "20 rows", "found 2"]);

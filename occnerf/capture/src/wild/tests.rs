@@ -54,12 +54,18 @@ fn frames_come_in_the_order_of_their_numbers() {
 fn a_metadata_of_any_text_encoding_is_read_and_occluders_of_no_frame_are_refused() {
     let (dir, metadata) = fixture("wild-text");
     let expected = load(&dir).unwrap();
-    // As Windows writes it.
-    let text = serde_json::to_string_pretty(&metadata).unwrap().replace('\n', "\r\n");
+    let text = serde_json::to_string_pretty(&metadata).unwrap();
     let utf16: Vec<u8> = "\u{feff}".chars().chain(text.chars()).flat_map(|c| (c as u16).to_le_bytes()).collect();
-    dir.write("metadata.json", utf16);
-    let found = load(&dir).unwrap();
-    assert!(found.train.iter().zip(&expected.train).all(|(a, b)| a.pose == b.pose && a.name == b.name));
+    for bytes in [
+        format!("\u{feff}{text}").into_bytes(),
+        text.replace('\n', "\r").into_bytes(),
+        text.replace('\n', "\r\n").into_bytes(),
+        utf16,
+    ] {
+        dir.write("metadata.json", bytes);
+        let found = load(&dir).unwrap();
+        assert!(found.train.iter().zip(&expected.train).all(|(a, b)| a.pose == b.pose && a.name == b.name));
+    }
     std::fs::rename(dir.path().join("occluders"), dir.path().join("old")).unwrap();
     dir.stripe("occluders/mask_77.png", SIZE, 255);
     fails(&dir, &["occluders", "names of frames", "mask_77"]);
@@ -253,6 +259,8 @@ fn faults_of_frames_name_file_and_key() {
     }
     // Behind the camera in one frame only: not an error.
     let mut away = metadata.clone();
+    // The last row as a product of matrices has it.
+    away["01"]["cam_extrinsics"][3] = json!([0.0, 1e-50, 0.0, 0.999_999_999_999_999_9]);
     away["02"]["cam_extrinsics"][2][3] = json!(-40.0);
     dir.write("metadata.json", away.to_string());
     assert!(load(&dir).is_ok());
@@ -272,6 +280,8 @@ fn faults_of_the_file_are_told() {
         (format!("{{\"00\":{{\"poses\":{}", "[".repeat(100_000)), &["00: poses", "recursion limit"]),
         (text.replace("0.25", "NaN"), &["poses"]),
         (text.replace("0.25", "1e999"), &["poses", "out of range"]),
+        (format!("{{\"00\":{{\"x\":[{}0]}}}}", "[],".repeat(1 << 21)), &["00: x", "more than 2097152 values"]),
+        (format!("{{\"00\":{{\"x\":[{}\"a\"]}}}}", "[1],".repeat(1 << 21)), &["00: x", "more than 2097152 values"]),
         (text[..text.len() / 2].to_owned(), &["EOF"]),
         ("[1, 2]".to_owned(), &["a dictionary"]),
         ("{\"00\": 3}".to_owned(), &["00", "a dictionary"]),

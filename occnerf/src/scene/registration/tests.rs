@@ -271,6 +271,29 @@ fn outlines_of_small_things_are_found_without_bias() {
     }
 }
 
+/// The middle of an antialiased edge is where its coverage says, wherever it falls between pixels.
+#[test]
+fn edges_of_antialiased_masks_are_found_without_bias() {
+    let mut errors = Vec::new();
+    for step in 0..20 {
+        let edge = 8.0 + step as f32 / 20.0;
+        let mask: Vec<f32> = (0..256).map(|i| (edge - (i % 16) as f32).clamp(0.0, 1.0)).collect();
+        let image = Image { width: 16, height: 16, pixels: mask.iter().flat_map(|m| [*m; 3]).collect() };
+        let camera = volrender::Camera::new(Mat3::IDENTITY, Affine3A::IDENTITY, 16, 16).unwrap();
+        let corners = [Vec3::new(0.0, 0.0, 1.0), Vec3::new(16.0, 16.0, 1.0)];
+        let crop = Crop::new(&camera, &Pixels { image, mask, occluder: None }, &corners).unwrap();
+        let at = |x: f32| crop.coverage_at(Vec2::new(x, 8.0)).unwrap();
+        let mut found = 4.0;
+        while at(found) >= 0.5 {
+            found += 0.01;
+        }
+        errors.push(found - edge);
+    }
+    let mean = errors.iter().sum::<f32>() / errors.len() as f32;
+    assert!(mean.abs() < 0.02, "{mean}");
+    assert!(errors.iter().all(|error| error.abs() < 0.15), "{errors:?}");
+}
+
 #[test]
 fn a_wrong_focal_length_is_mostly_mended_where_no_other_camera_says_what_it_is() {
     let body = BodyModel::embedded();

@@ -366,6 +366,8 @@ fn every_truncation_is_an_error() {
     for n in 0..whole.len() {
         assert!(Character::from_bytes("cut", &whole[..n]).is_err(), "{n} of {} bytes", whole.len());
     }
+    // What stands behind the end is no part of the container.
+    assert!(Character::from_bytes("made.glb", &[&whole[..], b"\n"].concat()).is_ok());
 }
 
 /// A shared character, at bind and in motion.
