@@ -189,11 +189,11 @@ mod tests {
     fn a_size_that_no_player_takes_and_a_picture_that_fails_leave_no_film() {
         let path = std::env::temp_dir().join(format!("xtask-never-written-{}", std::process::id()));
         let large = std::iter::once_with(|| Ok(RgbImage::new(8192, 8192)));
-        let error = film(large, FilmFormat::Mp4, 15, &path).unwrap_err().to_string();
+        let error = format!("{:#}", film(large, FilmFormat::Mp4, 15, &path).unwrap_err());
         assert!(error.contains("8192x8192"), "{error}");
         for format in [FilmFormat::Mp4, FilmFormat::Gif, FilmFormat::Png] {
             let broken = [Ok(RgbImage::new(16, 16)), Err(anyhow::anyhow!("a broken picture"))];
-            let error = film(broken.into_iter(), format, 15, &path).unwrap_err().to_string();
+            let error = format!("{:#}", film(broken.into_iter(), format, 15, &path).unwrap_err());
             assert!(error.contains("a broken picture"), "{error}");
         }
         assert!(!path.with_extension("mp4").exists() && !path.with_extension("gif").exists());
