@@ -30,7 +30,7 @@ const MOST: u32 = 2;
 const SLANT: f32 = 0.05;
 /// Least mean foreshortening of an observed point: at the rims of masks, grazing surface shows the
 /// background.
-const GRAZING: f32 = 0.2;
+const GRAZING: f32 = 0.3;
 /// Least sum of the reliabilities of an observed point where frames disagree, frames.
 const EVIDENCE: f32 = 4.0;
 /// Frames in flight, at some megabytes of observations each.
