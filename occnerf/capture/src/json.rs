@@ -24,7 +24,7 @@ pub(super) fn read(path: &Path, most: u64) -> Result<Value, CaptureError> {
     parsed.map_err(|error| CaptureError::invalid(path, "the file", "JSON", error.to_string()))
 }
 
-/// A value, and how many are kept outside of arrays.
+/// Parses a value; holds the number of values kept outside of arrays.
 #[derive(Clone, Copy)]
 struct Json<'a>(&'a Cell<usize>);
 

@@ -74,7 +74,7 @@ struct Mesh<'a> {
     avatar: &'a Avatar,
     /// Vertices of each triangle, (F).
     faces: Vec<[u32; 3]>,
-    /// Whether each is left, (F), and how many are.
+    /// Whether each triangle is left, (F), and their number.
     alive: Vec<bool>,
     left: usize,
     /// The point of each vertex, (V).
@@ -121,7 +121,7 @@ impl<'a> Mesh<'a> {
         Self { avatar, alive: vec![true; left], faces, left, points, about, places, errors, versions }
     }
 
-    /// Points that share an edge with one, ascending, and how many triangles have that edge.
+    /// Points that share an edge with one, ascending, and the number of triangles at that edge.
     fn ring(&self, point: u32) -> Vec<(u32, usize)> {
         let corners = |&face: &u32| self.faces[face as usize].map(|v| self.points[v as usize]);
         let mut all: Vec<u32> = self.about[point as usize].iter().flat_map(corners).filter(|&p| p != point).collect();

@@ -88,7 +88,7 @@ const CLOSE: f32 = 0.05;
 const REACH: f32 = 0.1;
 /// Least share of the mask beyond it that is a fault.
 const BEYOND: f32 = 0.01;
-/// Least share of that which a rotated limb has to explain.
+/// Least share of these pixels that a rotated limb has to explain.
 const EXPLAINED: f32 = 0.9;
 /// Least share of a limb outside the mask for it to be elsewhere.
 const OUTSIDE: f32 = 0.5;

@@ -305,8 +305,8 @@ fn good_captures_raise_no_alarm() {
     assert!(alarms.is_empty(), "{alarms:#?}");
 }
 
-/// A row of the table: a mistake, how many trials, found, named, with the right advice, and what
-/// was said else.
+/// A row of the table: a mistake; numbers of trials, of those found, named, and with the right
+/// advice; other findings.
 fn row(wrong: Wrong, captures: &[&(String, Capture, BodyModel)]) -> ([usize; 4], String) {
     let (mut counts, mut others) = ([captures.len(), 0, 0, 0], Vec::new());
     for (name, capture, body) in captures {

@@ -109,7 +109,7 @@ impl Segments {
         }
     }
 
-    /// How many rays there are.
+    /// Number of rays.
     pub fn num_rays(&self) -> usize {
         self.marches.len()
     }

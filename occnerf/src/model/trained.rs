@@ -119,7 +119,7 @@ impl Model {
             + self.field.mlp.num_true_parameters()
     }
 
-    /// How many training rays ended near each vertex; zeros where no neighbours are looked up.
+    /// Number of training rays that ended near each vertex; zeros without neighbour queries.
     pub fn visibility_counts(&self) -> &[u64] {
         self.counts.counts()
     }

@@ -49,7 +49,7 @@ pub fn mend_masks(mut capture: Capture, model: &BodyModel) -> Result<Mended, Err
     Ok(Mended { capture, mending: Mending { growth, background } })
 }
 
-/// Erodes or dilates the masks to the person's outline; by how many pixels they grow.
+/// Erodes or dilates the masks to the person's outline; returns the pixels by which they grow.
 fn resize(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
     match excess(&capture.train)? {
         0 => extend(capture, model),
@@ -110,7 +110,8 @@ fn total<const N: usize>(
     Ok(sums)
 }
 
-/// Grows the masks into the photographs near the body, away from occluders; by how many pixels.
+/// Grows the masks into the photographs near the body, away from occluders; returns the pixels by
+/// which they grow.
 fn extend(capture: &mut Capture, model: &BodyModel) -> Result<i32, Error> {
     let mut growth = 0;
     for _ in 0..PASSES {

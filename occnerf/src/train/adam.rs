@@ -121,8 +121,8 @@ impl Optimiser {
         all.for_each(|g| g.par_chunks_mut(1 << 16).for_each(|chunk| chunk.fill(0.0)));
     }
 
-    /// One Adam step of every part at its rate times `decay`; returns how many gradients were not
-    /// finite.
+    /// One Adam step of every part at its rate times `decay`; returns the number of gradients that
+    /// were not finite.
     pub fn step(&mut self, parameters: &mut Parameters, rates: &RateConfig, decay: f32) -> usize {
         let each = [rates.field, rates.table, rates.vertices, rates.motion];
         let parts = parameters.0.iter_mut().zip(&self.gradients.0).zip(&mut self.moments);

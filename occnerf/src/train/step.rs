@@ -151,7 +151,7 @@ pub(crate) fn zero(buffer: &mut Vec<f32>, len: usize) {
 pub(crate) struct OrderedSamples {
     /// First sample of each ray, and the end of the last.
     starts: Vec<usize>,
-    /// How many rays of each segment have had their turn.
+    /// Number of finished rays of each segment.
     done: Vec<usize>,
     /// Segment, and place in it, of each sample.
     places: Vec<(usize, usize)>,

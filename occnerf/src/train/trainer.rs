@@ -129,7 +129,7 @@ impl<'a> Trainer<'a> {
         self.model.steps_done
     }
 
-    /// Changes how many steps there are to be, and with it the fall of the learning rates.
+    /// Changes the number of steps and with it the decay of the learning rates.
     pub fn set_steps(&mut self, steps: u64) {
         self.model.config.steps = steps;
     }

@@ -142,12 +142,12 @@ fn capture(folder: &Path) -> PathBuf {
 fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
     let folder = folder("killed-training");
     let capture = capture(&folder);
-    let of = |out: &Path, steps: &str, more: &[&str]| {
-        let run = ["train", text(&capture), "--out", text(out), "--steps", steps];
+    let of = |out: &Path, more: &[&str]| {
+        let run = ["train", text(&capture), "--out", text(out), "--steps", "120"];
         words(&[&run[..], &QUICK, more].concat())
     };
     let whole = folder.join("whole");
-    let first = of(&whole, "120", &[]);
+    let first = of(&whole, &[]);
     done(&first.iter().map(String::as_str).collect::<Vec<_>>());
     let bytes = |run: &Path| std::fs::read(run.join("checkpoint.safetensors")).unwrap();
     let (mut random, mut lives) = (Random(1), 0);
@@ -159,11 +159,7 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
             lives += 1;
             let arguments = |out: &Path| {
                 let resume = out.join("config.toml").is_file();
-                of(
-                    out,
-                    "120",
-                    &[&["--checkpoint-every", interval][..], if resume { &["--resume"] } else { &[] }].concat(),
-                )
+                of(out, &[&["--checkpoint-every", interval][..], if resume { &["--resume"] } else { &[] }].concat())
             };
             let work = Work { name: "train", out: out.clone(), arguments: &arguments };
             until_it_ends(&work, 1000, &mut random, 12.min(kills()), &mut toll);

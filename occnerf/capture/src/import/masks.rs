@@ -250,9 +250,9 @@ type Joined = (BTreeMap<usize, Source>, Vec<String>);
 fn stack(path: &Path, video: &Video) -> Result<Joined, CaptureError> {
     let expected = "masks (frames, height, width), or the same with an axis of 1";
     if has_extension(path, &["npz"]) {
-        let keys = Npz::open(path)?.keys().join(", ");
-        if keys.contains(", ") {
-            return Err(CaptureError::invalid(path, "keys", "one array of masks", keys));
+        let npz = Npz::open(path)?;
+        if npz.keys().len() > 1 {
+            return Err(CaptureError::invalid(path, "keys", "one array of masks", npz.keys().join(", ")));
         }
     }
     let array = array(path, expected, |shape| matches!(shape, [_, _, _] | [_, 1, _, _] | [_, _, _, 1]))?;

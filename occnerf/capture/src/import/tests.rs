@@ -332,6 +332,12 @@ fn a_stack_with_an_axis_of_one_and_an_archive_are_masks() {
             assert!(levels.iter().enumerate().all(|(i, level)| (*level == 255) == (i == 3)), "{file} {shape:?}");
         }
     }
+    let arrays = ["masks", "boxes"].map(|key| (key, array_files::NdArray { shape: vec![3, 2, 4], data: data.clone() }));
+    npz::write(&dir.file("several.npz"), &arrays).unwrap();
+    let error = Masks::open(&dir.file("several.npz"), &ImportOptions::default(), &video).err().unwrap().to_string();
+    for word in ["several.npz", "one array of masks", "boxes"] {
+        assert!(error.contains(word), "{error}");
+    }
 }
 
 #[test]
