@@ -19,7 +19,7 @@ fn kills() -> usize {
 }
 
 /// Checks that every result under `folder` is whole: partial ones have names of their own. Returns
-/// how many there were.
+/// their number.
 fn all_whole(folder: &Path) -> usize {
     let mut count = 0;
     for entry in std::fs::read_dir(folder).into_iter().flatten() {

@@ -201,7 +201,7 @@ fn distance(figure: &Figure) -> Result<Kernel> {
     Ok(kernel)
 }
 
-/// The neighbours: how many change over 1 cm, which is how rough a function of them is.
+/// Neighbours: the share that changes over 1 cm, the roughness of a function of them.
 fn neighbours(figure: &Figure) -> Result<Kernel> {
     let mut kernel = Kernel {
         name: "neighbours",

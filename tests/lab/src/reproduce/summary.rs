@@ -17,7 +17,7 @@ use xtask::{pictures, table};
 #[derive(Serialize)]
 pub struct Summary {
     scene: String,
-    /// What every row starts from, and how many runs it has.
+    /// Settings common to all rows, and runs of each.
     settings: String,
     #[serde(skip)]
     table: Table,
