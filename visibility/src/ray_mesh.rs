@@ -1,4 +1,3 @@
-use std::collections::HashSet;
 use std::fmt;
 use std::time::Duration;
 
@@ -234,22 +233,16 @@ impl RayMesh {
     }
 }
 
-/// Bounds of the faces, padded. One that equals another's is grown by up to 10⁻⁵ of the
-/// coordinates: the builder joins boxes that are closest to each other, among equal ones a single
-/// pair a pass.
+/// Bounds of the faces, padded, each grown by its own share of 10⁻⁵ of the coordinates: the builder
+/// joins boxes that are closest to each other, among equal ones a single pair a pass.
 fn bounds(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Aabb> {
     let most = vertices.iter().map(|v| v.abs().max_element()).fold(1e-6, f32::max);
-    let mut seen = HashSet::new();
     let bounds = |(i, face): (u32, &[u32; 3])| {
         let [a, b, c] = face.map(|i| Vec3A::from(vertices[i as usize]));
-        let (low, high) = (a.min(b).min(c) - PADDING, a.max(b).max(c) + PADDING);
-        if seen.insert([low, high].map(|corner| corner.to_array().map(f32::to_bits))) {
-            return Aabb::new(low, high);
-        }
         // A Kronecker sequence: the shares of any two faces differ.
         let shares = (f64::from(i) * DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5)).fract();
-        let growth = 1e-5 * most * shares.as_vec3a();
-        Aabb::new(low - growth, high + growth)
+        let growth = 1e-5 * most * shares.as_vec3a() + PADDING;
+        Aabb::new(a.min(b).min(c) - growth, a.max(b).max(c) + growth)
     };
     (0..).zip(faces).map(bounds).collect()
 }

@@ -107,7 +107,7 @@ const SURE: f32 = 0.8;
 /// Distance from unobserved vertices of the validation vertices, metres of a body 1.7 high.
 const RIM: f32 = 0.08;
 /// Most validation vertices of a piece.
-const MOST_HELD: usize = 1024;
+const MOST_HELD: usize = 256;
 /// Least vertices of a joint's piece that chooses.
 const FEW: usize = 16;
 /// Least distance of a limb's joint from the plane of symmetry, x = 0, metres of such a body.
@@ -129,6 +129,7 @@ fn complete(body: &Body, colors: &mut [Vec3], foreshortening: &[f32]) {
     let joints = strongest(body);
     let guesses = Guesses::new(body, &joints, colors, foreshortening);
     let (hair, shown) = hair(body, &joints, &known);
+    let (shown, all) = (guesses.of(&shown), guesses.of(&known));
     let choice = |joint: usize| {
         let piece: Vec<usize> = unseen.iter().copied().filter(|&v| joints[v] == joint).collect();
         if piece.len() < FEW { 1.0 } else { guesses.choose(&known, &piece) }
@@ -142,12 +143,12 @@ fn complete(body: &Body, colors: &mut [Vec3], foreshortening: &[f32]) {
         let mixed = |around: f32| {
             let weights = body.model.weights.row(v).filter(|(joint, _)| choices[*joint] == around);
             let weight: f32 = weights.map(|(_, weight)| weight).sum();
-            if weight > 0.0 { (weight * guesses.guess(v, &known, around), weight) } else { (Vec3::ZERO, 0.0) }
+            if weight > 0.0 { (weight * guesses.guess(v, &all, around), weight) } else { (Vec3::ZERO, 0.0) }
         };
         let mixed = [1.0, AROUND, ALONG].map(mixed);
         let weight: f32 = mixed.iter().map(|mixed| mixed.1).sum();
         let sum: Vec3 = mixed.iter().map(|mixed| mixed.0).sum();
-        (v, if weight > 0.0 { sum / weight } else { guesses.guess(v, &known, 1.0) })
+        (v, if weight > 0.0 { sum / weight } else { guesses.guess(v, &all, 1.0) })
     };
     let found: Vec<(usize, Vec3)> = unseen.par_iter().map(guess).collect();
     found.into_iter().for_each(|(v, color)| colors[v] = color);
@@ -171,10 +172,21 @@ fn hair(body: &Body, joints: &[usize], known: &[usize]) -> (Vec<bool>, Vec<usize
     (hair, shown)
 }
 
+/// Vertices of a [`Group`].
+const LANES: usize = 8;
+
+/// Some vertices, coordinate by coordinate; those that fill the last group up have no area.
+#[derive(Default)]
+struct Group {
+    places: [[f32; LANES]; 3],
+    areas: [f32; LANES],
+    colors: [[f32; LANES]; 3],
+}
+
 struct Guesses<'a> {
     vertices: &'a [Vec3],
     /// Surface area of each vertex times its squared foreshortening, (V).
-    areas: Vec<f64>,
+    areas: Vec<f32>,
     /// Unit direction of each vertex's bone, (V).
     axes: Vec<Vec3>,
     colors: &'a [Vec3],
@@ -185,30 +197,49 @@ impl<'a> Guesses<'a> {
         let vertices = &body.canonical.vertices;
         let mut areas = vec![1e-12; vertices.len()];
         for corners in &body.model.faces {
-            let [a, b, c] = corners.map(|v| vertices[v as usize].as_dvec3());
+            let [a, b, c] = corners.map(|v| vertices[v as usize]);
             let area = (b - a).cross(c - a).length() / 6.0;
             corners.iter().for_each(|&v| areas[v as usize] += area);
         }
         // Weights of grazing surface alone stay above 0.
-        let squared = foreshortening.iter().map(|f| f64::from(f.max(1e-3)).powi(2));
+        let squared = foreshortening.iter().map(|f| f.max(1e-3).powi(2));
         areas.iter_mut().zip(squared).for_each(|(area, squared)| *area *= squared);
         Self { vertices, areas, axes: axes(body, joints), colors }
     }
 
-    /// Mean colour of the vertices `known`, weighted by area and distance⁻⁴.
-    fn guess(&self, v: usize, known: &[usize], around: f32) -> Vec3 {
-        let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
-        for &k in known {
-            let way = self.vertices[k] - self.vertices[v];
-            let along = way.dot(self.axes[v]);
-            let across = (way.length_squared() - along * along).max(0.0);
-            // Vertices of a seam may coincide.
-            let squared = f64::from(along * along + around * around * across).max(1e-12);
-            let weight = self.areas[k] / (squared * squared);
-            sum += weight * self.colors[k].as_dvec3();
-            weights += weight;
+    /// The vertices `known` and their colours.
+    fn of(&self, known: &[usize]) -> Vec<Group> {
+        let group = |known: &[usize]| {
+            let mut group = Group::default();
+            for (i, &k) in known.iter().enumerate() {
+                group.areas[i] = self.areas[k];
+                (0..3).for_each(|c| group.places[c][i] = self.vertices[k][c]);
+                (0..3).for_each(|c| group.colors[c][i] = self.colors[k][c]);
+            }
+            group
+        };
+        known.chunks(LANES).map(group).collect()
+    }
+
+    /// Mean colour of vertices, weighted by area and distance⁻⁴.
+    fn guess(&self, v: usize, known: &[Group], around: f32) -> Vec3 {
+        let ([x, y, z], axis) = (self.vertices[v].to_array(), self.axes[v]);
+        let (mut sums, mut weights) = ([[0.0; LANES]; 3], [0.0; LANES]);
+        for Group { places, areas, colors } in known {
+            for i in 0..LANES {
+                let way = [places[0][i] - x, places[1][i] - y, places[2][i] - z];
+                let along = way[0] * axis.x + way[1] * axis.y + way[2] * axis.z;
+                let length = way[0] * way[0] + way[1] * way[1] + way[2] * way[2];
+                let across = (length - along * along).max(0.0);
+                // Vertices of a seam may coincide.
+                let squared = (along * along + around * around * across).max(1e-12);
+                let weight = areas[i] / (squared * squared);
+                weights[i] += weight;
+                (0..3).for_each(|c| sums[c][i] += weight * colors[c][i]);
+            }
         }
-        (sum / weights).as_vec3()
+        let total = |lanes: &[f32; LANES]| lanes.iter().map(|lane| f64::from(*lane)).sum::<f64>();
+        (DVec3::from_array(sums.each_ref().map(total)) / total(&weights)).as_vec3()
     }
 
     /// Anisotropy of the vertices `unseen`: [`AROUND`], [`ALONG`] or 1 (isotropic), by the error of
@@ -219,6 +250,7 @@ impl<'a> Guesses<'a> {
         if rest.is_empty() {
             return 1.0;
         }
+        let rest = self.of(&rest);
         let every = held.len().div_ceil(MOST_HELD).max(1);
         let error = |around: f32| -> f32 {
             let error = |&v: &usize| self.guess(v, &rest, around).distance_squared(self.colors[v]);
@@ -368,7 +400,7 @@ mod tests {
         let mean = |of: &dyn Fn(usize) -> Vec3| {
             unseen.iter().map(|&v| (of(v).x - truth[v].x).abs()).sum::<f32>() / unseen.len() as f32
         };
-        [mean(&|v| colors[v]), mean(&|v| smooth.guess(v, &known, 1.0))]
+        [mean(&|v| colors[v]), mean(&|v| smooth.guess(v, &smooth.of(&known), 1.0))]
     }
 
     #[test]

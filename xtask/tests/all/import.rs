@@ -26,7 +26,7 @@ fn a_newcomer_gets_a_person_with_three_commands() {
     assert!(image::open(capture.join("check.png")).unwrap().width() > 500);
     let quick = ["--preset", "fast", "--method", "hash-point", "--steps", "1"];
     done(&[&["train", text(&capture), "--out", text(&run)], &quick[..]].concat());
-    done(&["render", text(&run), "tpose"]);
+    done(&["render", text(&run), "tpose", "--size", "64x64"]);
     // A second import needs leave to replace the first.
     let again = ["import", "--frames", text(&frames), "--fit", text(&fit), "--out", text(&capture)];
     refused(&again, &["--force"]);
@@ -162,8 +162,8 @@ fn without_a_body_model_the_open_body_stands_in() {
         let body = if words.is_empty() { vec!["--body", text(&known)] } else { Vec::new() };
         let said = done(&[&line[..], &["--out", text(&capture)], &body].concat());
         assert!(said.contains(words) && said.contains("open body of this program") != words.is_empty(), "{said}");
-        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
-        let row = said.lines().find(|line| line.starts_with("| surface")).unwrap();
+        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "prior"]);
+        let row = said.lines().find(|line| line.starts_with("| prior")).unwrap();
         scores.push(row.split('|').nth(5).unwrap().trim().parse::<f64>().unwrap());
     }
     println!("psnr_mask: open body under WHAM's and GVHMR's fit, the true body: {scores:?}");
