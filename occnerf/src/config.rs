@@ -274,6 +274,16 @@ pub struct RateConfig {
 }
 
 /// The configuration of a run.
+///
+/// ```
+/// use occnerf::{Component, Config, Method, Preset};
+///
+/// let mut config = Config::preset(Preset::Paper, Method::Occnerf);
+/// config.ablate(Component::Attention);
+/// assert!(config.surface.surface_term && config.validate().is_ok());
+/// config.samples = 0;
+/// assert_eq!(config.validate().unwrap_err().key, "samples");
+/// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {

@@ -26,6 +26,24 @@ pub struct Rendering {
 }
 
 /// Something that draws posed people.
+///
+/// ```
+/// use glam::Vec3;
+/// use occnerf::capture::{LoadOptions, load_capture};
+/// use occnerf::{Config, FieldRenderer, Method, Preset, PriorRenderer, Renderer, Scene, Trainer};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let body = smpl::BodyModel::embedded();
+/// let options = LoadOptions { resize: Some(24), max_frames: Some(3), ..Default::default() };
+/// let config = Config::preset(Preset::Fast, Method::Occnerf);
+/// let scene = Scene::new(&load_capture("../xtask/demo".as_ref(), &body, &options)?, &body, &config)?;
+/// let prior = PriorRenderer::new(&scene.body, scene.colors()?).render(&scene.eval[0].view, Vec3::ONE)?;
+/// let trainer = Trainer::new(&scene, config)?;
+/// let field = FieldRenderer::new(trainer.model())?.render(&scene.eval[0].view, Vec3::ONE)?;
+/// assert_eq!(prior.opacity.len(), field.opacity.len());
+/// # Ok(())
+/// # }
+/// ```
 pub trait Renderer: Sync {
     /// Draws the person in the pose and before the camera of `view`, over `background`.
     ///

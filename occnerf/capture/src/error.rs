@@ -1,6 +1,11 @@
 use std::path::{Path, PathBuf};
 
 /// A fault of a capture, in one line with file, key, expected and actual value.
+///
+/// ```
+/// let error = capture::Layout::detect("/nowhere".as_ref()).unwrap_err();
+/// assert_eq!(error.to_string(), "/nowhere: missing directory");
+/// ```
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {

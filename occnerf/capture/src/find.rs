@@ -5,6 +5,13 @@ use std::path::{Path, PathBuf};
 use super::CaptureError;
 
 /// A published dataset format, see [`load_capture`](super::load_capture).
+///
+/// ```
+/// use capture::Layout;
+///
+/// assert_eq!(Layout::detect("../../xtask/demo".as_ref())?, Layout::HumanNerf);
+/// # Ok::<(), capture::CaptureError>(())
+/// ```
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Layout {
     /// Raw ZJU-MoCap.

@@ -59,6 +59,16 @@ pub struct EvalFrame {
 }
 
 /// A monocular video of one person, with evaluation views of the same instants.
+///
+/// ```
+/// let body = smpl::BodyModel::embedded();
+/// let capture = capture::load_capture("../../xtask/demo".as_ref(), &body, &Default::default())?;
+/// assert_eq!(capture.train[0].pose.len(), body.num_joints());
+/// // A view of the instant of a training frame has its pose.
+/// let view = &capture.eval[0];
+/// assert_eq!(view.frame.pose, capture.train[view.train_index].pose);
+/// # Ok::<(), capture::CaptureError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Capture {
     /// Name of the directory it comes from, or `demo`.
@@ -72,6 +82,17 @@ pub struct Capture {
 }
 
 /// A capture with corrected masks, or with masks to be taken as they are.
+///
+/// ```
+/// use capture::{LoadOptions, Mended, Registered, load_capture};
+///
+/// let few = LoadOptions { max_frames: Some(2), ..LoadOptions::default() };
+/// let capture = load_capture("../../xtask/demo".as_ref(), &smpl::BodyModel::embedded(), &few)?;
+/// // Exact masks and bodies need no correction.
+/// let registered = Registered::from(Mended::from(capture).capture);
+/// assert_eq!((registered.mending.growth, registered.fists), (0, [0.0; 2]));
+/// # Ok::<(), capture::CaptureError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct Mended {
     /// The capture.

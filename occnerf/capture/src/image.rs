@@ -12,6 +12,12 @@ use super::CaptureError;
 pub const MAX_SIDE: u32 = 8192;
 
 /// An sRGB picture with values from 0 to 1.
+///
+/// ```
+/// let mut image = capture::Image::new(2, 1);
+/// image.pixels[3..].copy_from_slice(&[1.0, 0.5, 0.0]);
+/// assert_eq!([image.rgb(0, 0), image.rgb(1, 0)], [[0.0; 3], [1.0, 0.5, 0.0]]);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Image {
     /// Columns.

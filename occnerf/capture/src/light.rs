@@ -10,6 +10,14 @@ const LAMP: f32 = 0.5;
 /// Shading by normal n under one lamp plus ambient light, 1 + s · n + ½ |s| ((ŝ · n)² − ⅓) with
 /// slope s, at least 0.2: three bands of spherical harmonics (Ramamoorthi and Hanrahan 2001), the
 /// third being determined by the second. Even light by default.
+///
+/// ```
+/// use glam::Vec3;
+///
+/// let lamp = capture::Light { slope: 0.5 * Vec3::Y };
+/// assert!(lamp.on(Vec3::Y) > 1.0 && lamp.on(Vec3::NEG_Y) < 1.0);
+/// assert_eq!(capture::Light::default().on(Vec3::Y), 1.0);
+/// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Light {
     /// Direction of the lamp in the world times its intensity relative to the mean.

@@ -5,6 +5,16 @@ use super::image::MAX_SIDE;
 
 /// Options of loading a capture, valid for every layout except `camera`, for raw ZJU-MoCap only.
 /// Equality is that of the loaded data: `max_bytes` and `unseen` are not compared.
+///
+/// ```
+/// use capture::{LoadOptions, load_capture};
+///
+/// let options = LoadOptions { resize: Some(48), stride: 10, ..LoadOptions::default() };
+/// let capture = load_capture("../../xtask/demo".as_ref(), &smpl::BodyModel::embedded(), &options)?;
+/// let frame = &capture.train[1];
+/// assert_eq!((frame.name.as_str(), frame.camera.width), ("frame_000010", 48));
+/// # Ok::<(), capture::CaptureError>(())
+/// ```
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LoadOptions {

@@ -4,6 +4,11 @@ use super::Image;
 use std::ops::Range;
 
 /// A rectangle of pixels.
+///
+/// ```
+/// let area = capture::Area { columns: 1..3, rows: 0..1 };
+/// assert!(area.contains(2, 4) && !area.contains(4 + 2, 4) && !area.is_empty());
+/// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Area {
     /// Columns.
@@ -26,6 +31,16 @@ impl Area {
 }
 
 /// A frame's picture, mask and occluder.
+///
+/// ```
+/// use capture::{Area, Image, PackedPixels, Pixels};
+///
+/// let image = Image { width: 2, height: 1, pixels: vec![0.5; 6] };
+/// let mut pixels = Pixels { image, mask: vec![1.0; 2], occluder: None };
+/// pixels.hide(&Area { columns: 0..1, rows: 0..1 });
+/// assert_eq!((pixels.image.rgb(0, 0), &pixels.mask[..]), ([0.0; 3], &[0.0, 1.0][..]));
+/// assert_eq!(PackedPixels::new(&pixels).pixels(), pixels);
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pixels {
     /// Picture multiplied by `mask`: colours are premultiplied by coverage, and 0 where the mask is

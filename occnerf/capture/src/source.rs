@@ -11,6 +11,17 @@ use super::pixels::{Area, Pixels};
 use super::{CaptureError, Image};
 
 /// The pixels of a frame, packed in memory or in files. Clones share decoded pixels.
+///
+/// ```
+/// use capture::{Area, LoadOptions, load_capture};
+///
+/// let few = LoadOptions { max_frames: Some(2), ..LoadOptions::default() };
+/// let mut capture = load_capture("../../xtask/demo".as_ref(), &smpl::BodyModel::embedded(), &few)?;
+/// let source = &mut capture.train[0].source;
+/// source.hide(Area { columns: 0..192, rows: 0..192 });
+/// assert!(source.pixels()?.mask.iter().all(|coverage| *coverage == 0.0));
+/// # Ok::<(), capture::CaptureError>(())
+/// ```
 #[derive(Clone, Debug)]
 pub struct PixelSource(Place);
 

@@ -23,6 +23,25 @@ pub(super) const TERMS_PER_JOINT: usize = 9;
 /// Everything is in metres in a world that is right-handed and y up. The surface is in the
 /// canonical pose (the T-pose, all rotations zero), facing +z. V vertices, F triangles, J joints, T
 /// frames of a clip.
+///
+/// ```
+/// use occnerf::capture::{LoadOptions, load_capture};
+/// use occnerf::{Config, Method, Preset, Scene, bake, evaluate};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let body = smpl::BodyModel::embedded();
+/// let options = LoadOptions { resize: Some(48), max_frames: Some(4), ..Default::default() };
+/// let config = Config::preset(Preset::Fast, Method::Surface);
+/// let scene = Scene::new(&load_capture("../xtask/demo".as_ref(), &body, &options)?, &body, &config)?;
+/// let (avatar, report) = bake::fit(&scene)?;
+/// assert!(avatar.num_joints() == 24 && report.errors[1] < report.errors[0]);
+/// let light = scene.colors()?.light;
+/// let mut renderer = bake::BakedRenderer::new(&avatar, scene.body.scale, light, visibility::Samples::Four);
+/// let scores = evaluate(&scene, &mut renderer, &[&scene.eval[0]], None, |_, _| {})?;
+/// assert!(scores.mask_iou > Some(0.7), "{scores:?}");
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Avatar {
     /// Name of the scene, as the capture gives it.

@@ -16,6 +16,7 @@ use super::draw::{BakedRenderer, BilinearCorner, color, look};
 use crate::Error;
 use crate::capture::Light;
 use crate::model::view::pinhole;
+use crate::scene::colors::GRAZING;
 use crate::scene::hands::{HandPixels, is_arm};
 use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
@@ -40,7 +41,7 @@ const MAX_PIXELS: usize = 1 << 19;
 type Lookup = ([u32; 4], [f32; 4]);
 
 /// A photographed pixel as a linear function of the texels.
-struct PixelEquation {
+pub(super) struct PixelEquation {
     colour: Vec3,
     lookups: Vec<Lookup>,
     /// Weight, at most 1.
@@ -148,9 +149,9 @@ fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreem
     Estimate { values, weights, errors }
 }
 
-/// Equations of the fully covered subject pixels of a frame; `hands` has where it may show hands,
+/// Equations of the fully covered subject pixels of a frame on surface that does not graze; `hands` has where it may show hands,
 /// and whether each vertex of the avatar (V) belongs to a forearm or hand.
-fn equations(
+pub(super) fn equations(
     avatar: &Avatar,
     renderer: &mut BakedRenderer<'_>,
     frame: &PreparedFrame,
@@ -202,7 +203,10 @@ fn equations(
         let brightness: f32 = fragments().map(|fragment| share * look(avatar, looks, fragment).z).sum();
         let lookups = fragments().map(|fragment| lookup(avatar, look(avatar, looks, fragment).truncate(), share));
         let colour = color / brightness;
-        let slant = fragments().map(|fragment| share * cosine(fragment.face)).sum();
+        let slant: f32 = fragments().map(|fragment| share * cosine(fragment.face)).sum();
+        if slant < GRAZING {
+            return None;
+        }
         Some(PixelEquation { colour, lookups: lookups.collect(), trust: reliability.at(depth[i], slant) })
     };
     let mut out: Vec<Option<PixelEquation>> = Vec::new();

@@ -9,12 +9,14 @@ use visibility::Samples;
 use super::charts::{AtlasLayout, PADDING};
 use super::draw::BakedRenderer;
 use super::make::{Relief, add_motion, assemble, bake, fit, surface};
+use super::refine::equations;
 use super::surface::{CanonicalField, Place, Texel};
 use super::{Avatar, BakeReport, skirted, turn_upright};
 use crate::capture::{Capture, Light};
 use crate::config::{Config, Method, Preset};
 use crate::model::trained::upright;
 use crate::render::{FieldRenderer, Renderer};
+use crate::scene::labels::Label;
 use crate::scene::prepared::{PreparedFrame, Scene};
 use crate::train::trainer::Trainer;
 
@@ -87,6 +89,46 @@ fn the_surface_is_where_a_known_field_becomes_opaque_and_has_its_colours() {
         .collect();
     errors.sort_by(f32::total_cmp);
     assert!(errors[errors.len() * 9 / 10] < 0.03, "{}", errors[errors.len() * 9 / 10]);
+}
+
+/// Four rays a pixel tell which pixels show the surface, and at what slant.
+#[test]
+fn textures_are_fitted_to_pixels_of_surface_that_does_not_graze() {
+    let (body, config) = (smpl::BodyModel::embedded(), Config::preset(Preset::Fast, Method::Surface));
+    let large = demo(&DemoConfig { size: 160, frames: 2, eval_cameras: 0, ..DemoConfig::default() }, &body).unwrap();
+    let scene = Scene::new(&large, &body, &config).unwrap();
+    let (avatar, _) = known(&scene, |_, d| if d < HEIGHT { 5000.0 } else { 0.0 });
+    let mut renderer = BakedRenderer::new(&avatar, scene.body.scale, Light::default(), Samples::Four);
+    let (_, reliability, _) = scene.lighting().unwrap();
+    let [mut found, mut expected, mut grazing] = [0; 3];
+    for frame in &scene.train {
+        found += equations(&avatar, &mut renderer, frame, 1, (reliability, None)).unwrap().len();
+        let (vertices, camera) = (renderer.skin(&frame.view.posed.bones).0.to_vec(), &frame.view.camera);
+        let mesh = visibility::RayMesh::new(&vertices, &avatar.faces).unwrap();
+        let mask = &frame.pixels().unwrap().mask;
+        for i in (0..mask.len()).filter(|&i| frame.labels.at(i as u32) == Label::Subject && mask[i] >= 0.99) {
+            let (x, y) = ((i as u32 % camera.width) as f32, (i as u32 / camera.width) as f32);
+            let cosine = |(u, v): (f32, f32)| {
+                let ray = camera.ray(x + u, y + v);
+                let [a, b, c] = avatar.faces[mesh.first_hit(ray.origin, ray.direction)?.face as usize]
+                    .map(|v| vertices[v as usize]);
+                Some((b - a).cross(c - a).normalize_or_zero().dot(-ray.direction.normalize()))
+            };
+            let Some(cosines) = [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)]
+                .map(cosine)
+                .into_iter()
+                .collect::<Option<Vec<f32>>>()
+            else {
+                continue;
+            };
+            let is_grazing = cosines.iter().sum::<f32>() < 4.0 * 0.3;
+            [expected, grazing] = [expected + usize::from(!is_grazing), grazing + usize::from(is_grazing)];
+        }
+    }
+    assert!(
+        grazing > 30 && found.abs_diff(expected) <= 6,
+        "{found} equations, {expected} pixels, {grazing} that graze"
+    );
 }
 
 #[test]

@@ -50,6 +50,22 @@ pub struct FrameCheck {
 }
 
 /// A whole capture.
+///
+/// ```
+/// use occnerf::capture::{LoadOptions, load_capture};
+/// use occnerf::{Mistake, check};
+///
+/// # fn main() -> Result<(), Box<dyn std::error::Error>> {
+/// let body = smpl::BodyModel::embedded();
+/// let options = LoadOptions { resize: Some(96), stride: 6, ..Default::default() };
+/// let mut capture = load_capture("../xtask/demo".as_ref(), &body, &options)?;
+/// let found = check(&capture, &body)?;
+/// assert!(found.mistakes.is_empty() && found.mean_iou() > 0.7);
+/// capture.train.iter_mut().for_each(|frame| frame.camera.focal *= 2.0);
+/// assert!(matches!(check(&capture, &body)?.mistakes[..], [Mistake::Focal(_)]));
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Clone, Debug, PartialEq)]
 pub struct Check {
     /// The training frames in order.

@@ -17,6 +17,16 @@ const NORMALISED_HEIGHT: f32 = 1.7;
 const BOX_INFLATION: f32 = 0.05;
 
 /// A body model in the shape of one person, lengths normalised.
+///
+/// ```
+/// use occnerf::{Body, Config, Method, Preset};
+///
+/// let model = smpl::BodyModel::embedded();
+/// let body = Body::new(&model, &[], &Config::preset(Preset::Fast, Method::Occnerf))?;
+/// let rest = body.rest();
+/// assert_eq!((rest.vertices.len(), rest.joints.len()), (model.num_vertices(), 24));
+/// # Ok::<(), occnerf::Error>(())
+/// ```
 pub struct Body {
     /// The prior as handed in (lengths not normalised).
     pub model: BodyModel,

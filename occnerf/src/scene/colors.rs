@@ -28,9 +28,9 @@ const EDGE: f32 = 0.5;
 const MOST: u32 = 2;
 /// Least foreshortening weight of an observation.
 const SLANT: f32 = 0.05;
-/// Least mean foreshortening of an observed point: at the rims of masks, grazing surface shows the
-/// background.
-const GRAZING: f32 = 0.3;
+/// Least mean foreshortening of an observed point, and least foreshortening of a pixel that the
+/// texture is fitted to: at the rims of masks, grazing surface shows the background.
+pub(crate) const GRAZING: f32 = 0.3;
 /// Least sum of the reliabilities of an observed point where frames disagree, frames.
 const EVIDENCE: f32 = 4.0;
 /// Frames in flight, at some megabytes of observations each.

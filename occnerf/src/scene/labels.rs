@@ -14,6 +14,13 @@ pub enum Label {
 }
 
 /// The labels of a frame's pixels, 2 bits each.
+///
+/// ```
+/// use occnerf::{Label, Labels};
+///
+/// let labels = Labels::new(&[Label::Background, Label::Subject, Label::Unknown]);
+/// assert_eq!((labels.at(2), labels.num_subject(), labels.subject(0)), (Label::Unknown, 1, 1));
+/// ```
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Labels {
     words: Vec<Word>,

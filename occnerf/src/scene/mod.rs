@@ -1,7 +1,7 @@
 //! A capture made ready: normalised lengths, the prior registered, posed bodies, labelled pixels,
 //! colours of the prior and the light on it.
 
-mod colors;
+pub(crate) mod colors;
 pub(crate) mod hands;
 pub(crate) mod labels;
 pub(crate) mod masks;

@@ -3,6 +3,14 @@
 use std::path::PathBuf;
 
 /// The files of an import, and its options.
+///
+/// ```
+/// use capture::{ImportOptions, import};
+///
+/// let options = ImportOptions { frames: "frames".into(), fit: "wham_output.pkl".into(), ..Default::default() };
+/// let error = import(&options, "capture".as_ref()).unwrap_err();
+/// assert!(error.to_string().starts_with("frames: "));
+/// ```
 #[derive(Clone, Debug, Default)]
 pub struct ImportOptions {
     /// Folder of the video's frames, `.png` or `.jpg`, in the order of their names.
