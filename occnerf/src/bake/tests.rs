@@ -112,7 +112,7 @@ fn textures_are_fitted_to_pixels_of_surface_that_does_not_graze() {
                 let ray = camera.ray(x + u, y + v);
                 let [a, b, c] = avatar.faces[mesh.first_hit(ray.origin, ray.direction)?.face as usize]
                     .map(|v| vertices[v as usize]);
-                Some((b - a).cross(c - a).normalize_or_zero().dot(-ray.direction.normalize()))
+                Some((b - a).cross(c - a).normalize_or_zero().dot(-ray.direction.normalize_or_zero()))
             };
             let Some(cosines) = [(0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75)]
                 .map(cosine)
@@ -126,7 +126,7 @@ fn textures_are_fitted_to_pixels_of_surface_that_does_not_graze() {
         }
     }
     assert!(
-        grazing > 30 && found.abs_diff(expected) <= 6,
+        grazing > 10 && found.abs_diff(expected) <= 6,
         "{found} equations, {expected} pixels, {grazing} that graze"
     );
 }
