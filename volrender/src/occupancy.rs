@@ -260,8 +260,8 @@ impl FaceRegion {
     fn row(&self, y: i32, z: i32, left: f32) -> (i32, i32) {
         let rest = self.normal.y * (y as f32 + 0.5) + self.normal.z * (z as f32 + 0.5);
         let (a, b) = ((self.low - rest) * self.per_x - 0.5, (self.high - rest) * self.per_x - 0.5);
-        // Conversions saturate and truncate, which `first` ≥ 0 makes floors: a call of `floor` costs more
-        // than the rest of a row.
+        // Conversions saturate and truncate, which `first` ≥ 0 makes floors: a call of `floor` costs
+        // more than the rest of a row.
         let (low, high) = (a.min(b), a.max(b));
         let up = (low as i32).saturating_add((low > low as i32 as f32).into());
         let from = ((self.box_low.x - left) as i32).max(up);

@@ -149,8 +149,9 @@ fn jacobi(start: &[Vec3], equations: &[&[PixelEquation]], passes: u32, disagreem
     Estimate { values, weights, errors }
 }
 
-/// Equations of the fully covered subject pixels of a frame on surface that does not graze; `hands` has where it may show hands,
-/// and whether each vertex of the avatar (V) belongs to a forearm or hand.
+/// Equations of the fully covered subject pixels of a frame on surface that does not graze; `hands`
+/// has where it may show hands, and whether each vertex of the avatar (V) belongs to a forearm or
+/// hand.
 pub(super) fn equations(
     avatar: &Avatar,
     renderer: &mut BakedRenderer<'_>,
