@@ -403,6 +403,34 @@ mod tests {
         [mean(&|v| colors[v]), mean(&|v| smooth.guess(v, &smooth.of(&known), 1.0))]
     }
 
+    /// Any number of vertices, one of them in two places of the list.
+    #[test]
+    fn lanes_sum_as_a_plain_loop() {
+        let body = body();
+        let joints = strongest(&body);
+        let mut random = RandomStream::new(&[12]);
+        let vertices = body.canonical.vertices.len();
+        let colors: Vec<Vec3> =
+            (0..vertices).map(|_| Vec3::new(random.uniform(), random.uniform(), random.uniform())).collect();
+        let guesses = Guesses::new(&body, &joints, &colors, &vec![0.7; vertices]);
+        for count in [1, 7, 8, 9, 500] {
+            let mut known: Vec<usize> = (0..count).map(|_| random.below(vertices)).collect();
+            known.push(known[0]);
+            let (v, around) = (random.below(vertices), [AROUND, 1.0, ALONG][count % 3]);
+            let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
+            for &k in &known {
+                let way = (body.canonical.vertices[k] - body.canonical.vertices[v]).as_dvec3();
+                let along = way.dot(guesses.axes[v].as_dvec3());
+                let across = (way - along * guesses.axes[v].as_dvec3()).length_squared();
+                let squared = (along * along + f64::from(around).powi(2) * across).max(1e-12);
+                let weight = f64::from(guesses.areas[k]) / squared.powi(2);
+                (sum, weights) = (sum + weight * colors[k].as_dvec3(), weights + weight);
+            }
+            let found = guesses.guess(v, &guesses.of(&known), around).as_dvec3();
+            assert!(found.distance(sum / weights) < 1e-3, "{count}: {found} for {}", sum / weights);
+        }
+    }
+
     #[test]
     fn stripes_go_on_the_way_that_they_go_where_they_are_seen() {
         let [rings, smooth] = errors(|v| (60.0 * v.y).sin());

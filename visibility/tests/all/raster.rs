@@ -53,7 +53,7 @@ fn depths(mesh: &TriMesh, view: &View, face: u32, pixel: usize) -> [f64; 2] {
     [around.into_iter().fold(f64::INFINITY, f64::min), around.into_iter().fold(f64::NEG_INFINITY, f64::max)]
 }
 
-/// Compares every pixel with the ray through its centre; returns how many hit.
+/// Compares every pixel with the ray through its centre; returns the number that hit.
 fn check_against_rays(mesh: &TriMesh, view: &View) -> Result<usize, TestCaseError> {
     let rays = RayMesh::new(&mesh.vertices, &mesh.faces).unwrap();
     let eye = view.centre_of_projection().unwrap();

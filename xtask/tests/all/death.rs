@@ -143,7 +143,7 @@ fn a_training_killed_at_any_moment_ends_the_same_to_the_bit() {
     let folder = folder("killed-training");
     let capture = capture(&folder);
     let of = |out: &Path, more: &[&str]| {
-        let run = ["train", text(&capture), "--out", text(out), "--steps", "60"];
+        let run = ["train", text(&capture), "--out", text(out), "--steps", "120"];
         words(&[&run[..], &QUICK, more].concat())
     };
     let whole = folder.join("whole");

@@ -266,10 +266,10 @@ fn a_signal_before_the_first_step_says_that_nothing_was_made() {
     assert!(output.status.code() == Some(143) && said.contains("had not been made"), "{said}");
 }
 
-/// Ten seconds; `STORM=120 cargo test -p xtask storm` for two minutes.
+/// Twenty seconds; `STORM=120 cargo test -p xtask storm` for two minutes.
 #[test]
 fn after_a_storm_of_commands_on_one_run_everything_is_as_one_alone_would_make_it() {
-    let length = std::env::var("STORM").ok().map_or(10, |seconds| seconds.parse().expect("STORM is a number"));
+    let length = std::env::var("STORM").ok().map_or(20, |seconds| seconds.parse().expect("STORM is a number"));
     let folder = folder("storm");
     let (_, run) = trained(&folder, "1");
     let (glb, renders) = (folder.join("person.glb"), folder.join("drawn"));

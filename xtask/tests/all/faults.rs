@@ -113,7 +113,7 @@ fn a_folder_in_use_is_refused_until_its_process_has_died() {
 fn signals_save_first_and_the_end_is_the_same_to_the_bit_after_a_death_too() {
     let folder = folder("signals");
     let whole = folder.join("whole");
-    done(&training(&whole, "50"));
+    done(&training(&whole, "80"));
     // Who is killed saves nothing: nearly always writing a checkpoint.
     let cases =
         [("-INT", Some(130), "30"), ("-TERM", Some(143), "30"), ("-HUP", Some(129), "30"), ("-KILL", None, "0")];
@@ -123,7 +123,7 @@ fn signals_save_first_and_the_end_is_the_same_to_the_bit_after_a_death_too() {
             continue;
         }
         let run = folder.join(signal);
-        let child = start(&[training(&run, "50"), vec!["--checkpoint-every", every]].concat());
+        let child = start(&[training(&run, "80"), vec!["--checkpoint-every", every]].concat());
         wait_for(&run.join(if code.is_some() { "train.jsonl" } else { "checkpoint.safetensors" }));
         let (ended, said) = stopped(child, signal);
         assert_eq!(ended, code, "{said}");
@@ -172,7 +172,7 @@ fn what_the_program_was_started_to_ignore_stays_ignored() {
 #[test]
 fn a_periodic_save_that_fails_is_tried_again() {
     let run = folder("save-again").join("run");
-    let child = start(&[training(&run, "100"), vec!["--checkpoint-every", "0.01"]].concat());
+    let child = start(&[training(&run, "150"), vec!["--checkpoint-every", "0.01"]].concat());
     let checkpoint = run.join("checkpoint.safetensors");
     wait_for(&checkpoint);
     while std::fs::remove_file(&checkpoint).and_then(|()| std::fs::create_dir(&checkpoint)).is_err() {}

@@ -162,8 +162,8 @@ fn without_a_body_model_the_open_body_stands_in() {
         let body = if words.is_empty() { vec!["--body", text(&known)] } else { Vec::new() };
         let said = done(&[&line[..], &["--out", text(&capture)], &body].concat());
         assert!(said.contains(words) && said.contains("open body of this program") != words.is_empty(), "{said}");
-        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "prior"]);
-        let row = said.lines().find(|line| line.starts_with("| prior")).unwrap();
+        let said = done(&["train", text(&capture), "--out", text(&run), "--method", "surface"]);
+        let row = said.lines().find(|line| line.starts_with("| surface")).unwrap();
         scores.push(row.split('|').nth(5).unwrap().trim().parse::<f64>().unwrap());
     }
     println!("psnr_mask: open body under WHAM's and GVHMR's fit, the true body: {scores:?}");

@@ -130,7 +130,7 @@ fn people_of_sam_3d_body_are_told_apart_and_a_body_is_fitted_to_each() {
     ];
     let out = Directory::new("import-sam3d");
     let body = BodyModel::embedded();
-    for (noise, most) in [(0.0, [0.004, 7.0]), (0.03, [0.024, 13.5])] {
+    for (noise, most) in [(0.0, [0.004, 7.0]), (0.015, [0.015, 11.0]), (0.03, [0.024, 13.5]), (0.045, [0.032, 16.0])] {
         let mut random = Random(11);
         // The second is not seen for some frames, the order changes.
         let frame = |f: usize| {
@@ -243,7 +243,7 @@ fn vertices_of_a_mesh_tell_the_twist_of_limbs_through_a_map() {
         array_files::npz::write(&map, &parts).unwrap();
     };
     write(&ids, &weights);
-    for (noise, most) in [(0.0, [0.004, 3.0]), (0.03, [0.016, 9.0])] {
+    for (noise, most) in [(0.0, [0.004, 3.0]), (0.015, [0.01, 6.0]), (0.03, [0.016, 9.0]), (0.045, [0.02, 11.0])] {
         let mut random = Random(5);
         let frames = truth.iter().map(|(points, ..)| Py::List(vec![person(points, &mut random, noise, true)]));
         out.write("video.pkl", Py::List(frames.collect()).pickle());

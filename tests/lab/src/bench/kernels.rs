@@ -424,7 +424,7 @@ mod tests {
 
     #[test]
     fn better_approximations_have_smaller_errors() {
-        let figure = Figure::new(300);
+        let figure = Figure::new(600);
         let distance = distance(&figure).unwrap();
         assert!(error(&distance, "exact") == 0.0 && (0.1..5.0).contains(&error(&distance, "blend of 5")));
         let neighbours = neighbours(&figure).unwrap();

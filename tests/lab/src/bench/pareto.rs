@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn charts_are_drawn_of_any_lines_at_all() {
         let stem = std::env::temp_dir().join(format!("lab-pareto-{}", std::process::id()));
-        for count in [0, 1, 12] {
+        for count in [0, 1, 40] {
             let name = |i: usize| format!("point <{i}> & more");
             let of = |i: usize| {
                 let mut line = line(&name(i), "k", Kind::Change, 20.0 + (i % 7) as f64, 1.0 + (i % 5) as f64);

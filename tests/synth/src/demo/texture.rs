@@ -21,7 +21,7 @@ const WHITE: Vec3 = Vec3::new(0.93, 0.93, 0.91);
 /// What a person wears.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Dress {
-    /// Height of a stripe with its neighbours, metres, and by how much stripes rise outward.
+    /// Height of a stripe with its neighbours, metres, and the rise of stripes outward.
     period: f32,
     slant: f32,
     /// The channels that red, green and blue are taken from.

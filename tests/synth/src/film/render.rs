@@ -11,7 +11,7 @@ use volrender::RandomStream;
 
 /// Rays a pixel, along each axis.
 const SAMPLES: u32 = 2;
-/// Most surfaces with holes along a ray, and by how much farther than a hole it goes on.
+/// Most surfaces with holes along a ray, and the distance beyond a hole at which it goes on.
 const LAYERS: usize = 32;
 const BEYOND: f32 = 1.000_01;
 /// Light from everywhere, light from above, light of the lamp, and what the lamp gives on average.
