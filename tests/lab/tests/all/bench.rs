@@ -25,7 +25,7 @@ fn self_contained(page: &str) {
 #[test]
 fn a_sweep_goes_on_where_it_was_cut_off() {
     let out = folder("sweep");
-    let sweep = ["bench", "stability", "--quick", "--axes", "frames", "--side", "24", "--steps", "1"];
+    let sweep = ["bench", "stability", "--quick", "--axes", "hidden", "--side", "24", "--steps", "1"];
     let sweep = [&sweep[..], &["--out", text(&out)]].concat();
     let first = done(&sweep);
     // Two levels of five methods.
@@ -50,7 +50,7 @@ fn a_sweep_goes_on_where_it_was_cut_off() {
     assert!(page.contains("report.html"), "{page}");
     let page = std::fs::read_to_string(out.join("report.html")).unwrap();
     self_contained(&page);
-    assert!(page.contains("frames") && page.contains("data:image/svg+xml;base64,"));
+    assert!(page.contains("hidden") && page.contains("data:image/svg+xml;base64,"));
 }
 
 #[test]
